@@ -171,6 +171,7 @@ class Findings:
     added: Added
     doubt: str = ""
     limit: str = ""
+    compared: int = 0  # number of effects
 
     @property
     def state(self) -> schema.State:
@@ -261,7 +262,7 @@ def build_verdict(
             set_aside=found.added.set_aside if found.named else (),
             untestable=dict(data.untestable),
             defects=dict(data.defects),
-            examined=data.examined,
+            examined=data.examined.model_copy(update={"compared": found.compared}),
             p_global=schema.Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
             replicates=data.effort.replicates,
             work=round(data.effort.spent, 1),
@@ -423,13 +424,16 @@ def _title(tag: str) -> str:
 
 
 def _rest(found: Findings) -> str:
-    """State the remaining share of the gap; empty if it is within sampling noise."""
+    """State the remaining gap; empty if it is within sampling noise."""
     after = found.added.after
     if after.at_floor or found.before.value <= 0.0:
         return ""
     if after.value <= after.floor:
         return f"; a significant discrepancy remains in {schema.families_words(after.standing_out)}"
-    return f"; {percent(1.0 - found.closed)} of the discrepancy remains"
+    single = "" if found.still else ", in no single statistic"
+    limit = f"sampling noise up to {schema.micronats(after.floor)}"
+    rest = f"{schema.micronats(after.value, after.interval)} micronats per sample"
+    return f"; {percent(1.0 - found.closed)} of the discrepancy remains{single} ({rest}, {limit})"
 
 
 def _broken(found: Findings) -> str:

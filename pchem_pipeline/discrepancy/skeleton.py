@@ -47,7 +47,7 @@ class Explainer(ABC, Generic[Explanation]):
     """A way to tell effects apart in one kind of data; it keeps the model."""
 
     prepared: Prepared  # the data and the model before the search
-    candidates: Sequence[str] = ()  # tags of the effects that are compared, once they are
+    candidates: Sequence[str] = ()  # tags (with numbers) of the effects that are compared, once they are
     limit: str = ""  # what was not tried when the search had used its budget; empty if it finished
 
     @property
@@ -115,8 +115,9 @@ def search(by: Explainer[Explanation], progress: Callable[[str], None] = no_prog
     if not disagreed and before.at_floor and not any(each.named for each in added.additions):
         # data that agree with the model are not made doubtful by what they do not confirm
         null, still, added = first, False, Added((), before)
+    many = len({tag.partition(" ")[0] for tag in by.candidates})
     found = Findings(
-        data.samples, z, first, null, before, places, still, added, data.doubt, limit or by.limit
+        data.samples, z, first, null, before, places, still, added, data.doubt, limit or by.limit, many
     )
     model = found.model(present, by.model)
     return build_verdict(found, data, model, by.fitted(model))

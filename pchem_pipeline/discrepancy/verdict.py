@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import StoreError, error_words
-from pchem_pipeline.base.wording import percent, short
+from pchem_pipeline.base.wording import count, measured, percent, short
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
@@ -102,11 +102,11 @@ class Size(_Part):
     samples: Number = 1.0
 
     def words(self) -> str:
-        """Describe the size: ``samples change by 0.5 DN rms, 22 % of the read noise``."""
-        which = "samples" if self.samples >= RARE else f"{percent(self.samples)} of samples"
-        share = self.of_read_noise
+        """Describe the size: ``samples change by 0.5 DN rms, 22 % of the median read noise``."""
+        rare = f"{percent(self.samples)} of the samples in its region and frames"
+        which, share = "samples" if self.samples >= RARE else rare, self.of_read_noise
         times = f"{percent(share)} of" if share < _TIMES else f"{short(share, 2)} times"
-        return f"{which} change by {short(self.dn, 2)} DN rms, {times} the read noise"
+        return f"{which} change by {short(self.dn, 2)} DN rms, {times} the median read noise"
 
 
 class Rival(_Part):
@@ -221,7 +221,7 @@ class GapChange(_Part):
     def after_text(self) -> str:
         """The gap with the effects, micronats: ``< 13`` where it is within sampling noise of up to 13."""
         reached = self.after <= self.floor < self.before
-        return f"< {micronats(self.floor)}" if reached else micronats(self.after)
+        return f"< {micronats(self.floor)}" if reached else micronats(self.after, self.interval_after)
 
 
 class Change(_Part):
@@ -247,6 +247,11 @@ class Surveyed(_Part):
     p: Number
 
 
+def _window(rows: tuple[int, int], columns: tuple[int, int]) -> str:
+    """Describe a window, first and end of each."""
+    return f"rows {rows[0]} to {rows[1] - 1}, columns {columns[0]} to {columns[1] - 1}"
+
+
 class Elsewhere(_Part):
     """Test of the final model in another window (first and end); ``deviates`` says what disagrees there."""
 
@@ -256,9 +261,7 @@ class Elsewhere(_Part):
 
     def words(self) -> str:
         """Describe the window."""
-        return (
-            f"rows {self.rows[0]} to {self.rows[1] - 1}, columns {self.columns[0]} to {self.columns[1] - 1}"
-        )
+        return _window(self.rows, self.columns)
 
     def says(self) -> str:
         """Describe the window and the result."""
@@ -283,11 +286,31 @@ class Examined(_Part):
     unfitted: int = 0  # number of pixels left out for lack of a reliable fit
     elsewhere: Elsewhere | None = None  # test of the model in another window; None: not done
     left_out: tuple[int, ...] = ()  # empty, repeated, outlying and moved frames
+    compared: int = 0  # number of effects compared with them
 
     @property
     def origin(self) -> tuple[int, int]:
         """First row and column."""
         return self.rows[0], self.columns[0]
+
+    def words(self) -> str:
+        """Describe the samples, what became of the others, and how many effects were compared."""
+        effects = f"; {self.compared} of the known effects compared" if self.compared else ""
+        dealt = f"{self.train:,} for training, {self.test:,} for testing, {self.final:,} for the gap"
+        if self.histograms is not None:
+            return f"{count(self.histograms, 'histogram')}, samples split at random: {dealt}{effects}."
+        share = f" ({percent(self.share)} of the run's samples)" if self.share < 1.0 else ""
+        place = _window(self.rows, self.columns)
+        rest = self.frames - self.train - self.test - self.final
+        over = f"; {rest} unused" if rest > 0 else ""
+        words = f"{count(self.frames, 'frame')} of {place}{share}: {dealt}{over}{effects}."
+        if self.elsewhere is not None:
+            words += f" The final model was {self.elsewhere.says()}."
+        if self.unfitted:
+            spot = next((place for place in self.places if place.map == "unfitted"), None)
+            where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
+            words += f" Not compared: {count(self.unfitted, 'pixel')} without a reliable fit{where}."
+        return words
 
 
 class Step(_Part):
@@ -417,6 +440,12 @@ class Verdict(_Part):
         return step.effect is not None or (step.verdict == "described" and not self.proposed)
 
     @property
+    def closed_by(self) -> str:
+        """The effects, by tag, that close most of a gap though they are rejected; empty if they are not."""
+        names = " + ".join(step.likeliest for step in self.steps)
+        return f" by {names}, rejected" if self.verdict == "unexplained" else ""
+
+    @property
     def word(self) -> str:
         """The verdict with spaces."""
         return self.verdict.replace("_", " ")
@@ -489,8 +518,12 @@ class Verdict(_Part):
         return self.model_copy(update={"examined": examined, "where": where})
 
 
-def micronats(gap: float) -> str:
-    """Format a gap, nats per sample, in micronats; negative estimates as 0."""
+def micronats(gap: float, interval: Interval = (_NAN, _NAN)) -> str:
+    """Format a gap in micronats, with a standard error if its 95 % interval is known; else not below 0."""
+    error = 1e6 * (interval[1] - interval[0]) / 3.92
+    if math.isfinite(gap) and error > 0.0:
+        large = f"{1e6 * gap:,.0f} ± {error:,.0f}".replace("-", "−")
+        return large if 9.95 <= error < math.inf else measured(1e6 * gap, error)
     value = 1e6 * max(gap, 0.0)
     return "not known" if not math.isfinite(gap) else f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}"
 

@@ -230,7 +230,7 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
 
 
 def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
-    """Return the window of DN that stands out most, of any width."""
+    """Return the window of DN that stands out most, of any width, or the code if it is a single one."""
     if not name.startswith("code."):
         return None
     code = evidence.code
@@ -241,7 +241,7 @@ def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
     deviation = (code.observed - code.expected) / np.sqrt(expected)
     total = np.concatenate([[0.0], np.cumsum(deviation)])
     best, window = 0.0, (0, 1)
-    for width in range(1, min(_WIDEST_CODE_WINDOW, deviation.size) + 1):
+    for width in range(1, 2 if name == "code.largest" else min(_WIDEST_CODE_WINDOW, deviation.size) + 1):
         sums = np.abs(total[width:] - total[:-width]) / np.sqrt(width)
         start = int(np.argmax(sums))
         if sums[start] > best:
@@ -258,7 +258,7 @@ def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
         found = time.repeated
     elif name.startswith("tail.high"):
         found = np.unique(time.hits[:, 0])
-    elif name.endswith(".largest"):
+    elif name.startswith("frame.") and name.endswith(".largest"):
         series = time.frame_charge if ".charge." in name else time.frame_readout
         away = np.abs(series - np.median(series))
         order = np.argsort(-away)

@@ -168,8 +168,9 @@ class Extension:
         )
 
     def _others(self, member: int) -> list[_Other]:
-        """Return all that could stand in the place of a member of the chosen set, the best first."""
+        """Return the other effects that could stand in the place of one of the set, the best first."""
         compared, added = self.compared, self.added[member]
+        own = {h.effect.tag for h in self.added}
         kept = [h for h in self.added if h is not added]
         found: dict[str, _Other] = {}
         for name, (effect, one) in compared.exchanged(added).items():
@@ -182,7 +183,7 @@ class Extension:
         best = fit_set(self.added, shift, noise).log_score(shift, noise)
         refitted = {*compared.chosen.tags, *found}
         for hypothesis in self.hypotheses:
-            if hypothesis.tag in refitted or hypothesis.effect.tag == added.effect.tag:
+            if hypothesis.tag in refitted or hypothesis.effect.tag in own:
                 continue
             fit = fit_set([*kept, hypothesis], shift, noise)
             mean = self.accept.first.mean + fit.parts.sum(axis=0)
@@ -192,7 +193,9 @@ class Extension:
             if hypothesis.tag not in found or behind > found[hypothesis.tag].behind:
                 closes = bool(fit.factors[-1] > 0.0)
                 found[hypothesis.tag] = _Other(hypothesis.effect, behind, mean, rest, closes)
-        return sorted(found.values(), key=lambda other: -other.behind)
+        ranked = sorted(found.values(), key=lambda other: other.behind)
+        first = {other.effect.tag: other for other in ranked if other.effect.tag not in own}
+        return sorted(first.values(), key=lambda other: -other.behind)
 
     def _rival(self, other: _Other, later: FloatArray) -> Rival:
         """Return a rival with its gap without ``later`` effects, and what speaks against it."""

@@ -187,6 +187,7 @@ class FrameExplainer(Explainer[Screened]):
         """Simulate what candidates would do; None where data agree and no set predicts held-out frames."""
         self.work.effort.check("the candidates were compared")
         screened = self.screening.of(self.given, null)
+        self.candidates = [h.tag for h in screened.hypotheses]
         self.work.effort.leave_for_fits()
         return screened if disagreed or screened.gain > CONVINCING else None
 
@@ -197,7 +198,6 @@ class FrameExplainer(Explainer[Screened]):
         Where data and model disagree, one that leaves nothing is taken in the end, though it is not certain.
         """
         self.work.forget(self.given)
-        self.candidates = [h.tag for h in explanation.hypotheses]
         refitter, settings = self._refitter(), self.prepared.settings
 
         def report(best: str) -> None:

@@ -34,7 +34,7 @@ class Statistic:
     name: str  # ``family.what``
     channel: str  # charge (electron numbers), readout (residuals), cross (their products) or digital (codes)
     sentence: str  # meaning of a large positive value
-    opposite: str = ""  # meaning of a large negative value; empty: less than the model predicts
+    opposite: str = ""  # meaning of a large negative value; empty: less than by chance
     map: str = ""  # of the evidence in which it shows its place (:mod:`~..where`); empty: none
     series: str = ""  # of the evidence in which it shows its frames; empty: none
 
@@ -47,7 +47,7 @@ class Statistic:
         """Return the meaning of a value of this sign."""
         if not z < 0.0:
             return self.sentence
-        return self.opposite or f"{self.sentence}, less than the model predicts"
+        return self.opposite or f"{self.sentence}, less than by chance"
 
 
 #: Of each score its channel, the meaning of a positive [or negative] value, and of either.
@@ -72,7 +72,7 @@ _SCORES: dict[str, tuple[str, str, str]] = {
 _OF_A_SCORE = """
 {channel} shape.{score}.mean map=score.{score} {says} (mean over pixels)
 {channel} shape.{score}.chi map=score.{score} {either} (sum of squares over pixels)
-{channel} shape.{score}.cnt map=score.{score} {either}, in more pixels than by chance
+{channel} shape.{score}.cnt map=score.{score} {either}, in [more|fewer] pixels than by chance
 {channel} shape.{score}.slope map=score.{score} {says}, increasingly with exposure
 """
 #: All others: channel, name, map and series, and the meaning of a large positive [or negative] value. Those
@@ -82,14 +82,14 @@ _OTHERS = """
 digital shape.goodness.mean map=goodness histograms [deviate from the model|are closer to the model than
         sampling noise] (mean over pixels)
 digital shape.goodness.chi map=goodness histograms deviate from the model (sum of squares over pixels)
-digital shape.goodness.cnt map=goodness histograms deviate strongly from the model, in more
+digital shape.goodness.cnt map=goodness histograms deviate strongly from the model, in [more|fewer]
         pixels than by chance
 readout shape.peaks.mean map=peaks the peaks of the histograms [deviate from the model|are closer to the
         model than sampling noise] (mean over pixels)
 readout shape.peaks.chi map=peaks the peaks of the histograms deviate from the model (sum of squares over
         pixels)
 readout shape.peaks.cnt map=peaks the peaks of the histograms deviate strongly from the model, in
-        more pixels than by chance
+        [more|fewer] pixels than by chance
 digital code.rough counts deviate from the model from code to code
 digital code.alternating counts of adjacent codes deviate from the model with [opposite signs|the same sign]
 digital code.smooth counts deviate from the model smoothly along DN
@@ -101,9 +101,9 @@ digital code.largest the count of one code is an outlier
 digital code.top samples pile up at the highest code (saturation)
 digital code.bottom samples pile up at the lowest code (clipping)
 readout tail.low.count too [many samples below the range|few samples at the low end] of the model
-readout tail.low.pixels too many pixels with samples below the range of the model
+readout tail.low.pixels too [many|few] pixels with samples below the range of the model
 charge  tail.high.count too [many samples above the range|few samples at the high end] of the model
-charge  tail.high.pixels too many pixels with samples above the range of the model
+charge  tail.high.pixels too [many|few] pixels with samples above the range of the model
 charge  tail.high.clusters samples above the range of the model are adjacent in a frame
 both    time.lag1.{c}.mean map=lag.{c} {of} of successive frames are [correlated|anticorrelated] (mean over
         pixels)
@@ -112,7 +112,7 @@ both    time.lag2.{c}.mean map=lag.{c} {of} of frames two apart are [correlated|
 both    time.lag3.{c}.mean {of} of frames three apart are [correlated|anticorrelated] (mean over pixels)
 both    time.lag1.{c}.chi map=lag.{c} {of} of successive frames are correlated (sum of squares over
         pixels)
-both    time.lag1.{c}.cnt map=lag.{c} {of} of successive frames are strongly correlated, in more
+both    time.lag1.{c}.cnt map=lag.{c} {of} of successive frames are strongly correlated, in [more|fewer]
         pixels than by chance
 cross   time.cross.readout_charge map=lag.cross residuals [rise|fall] with the charge of the frame before
 cross   time.cross.readout_charge.chi map=lag.cross residuals change with the charge of the frame before
@@ -122,8 +122,8 @@ digital time.nearer samples are [closer to|farther from] the previous sample tha
 cross   time.follows.sample residuals change with the charge of another pixel one frame before
 cross   time.follows.line residuals change with the charge of a row, column or frame one frame before
 both    time.block.{c}.chi map=spread.{c} block means of the {of} vary (sum of squares over pixels)
-both    time.block.{c}.cnt map=spread.{c} block means of the {of} vary strongly, in more pixels than by
-        chance
+both    time.block.{c}.cnt map=spread.{c} block means of the {of} vary strongly, in [more|fewer]
+        pixels than by chance
 both    frame.{c}.variance map=x.{p} series=scatter.{c} frame means of the {of} scatter [more|less] than
         independent pixels
 both    frame.{c}.lag1 series=frame.{c} frame means of the {of} are [correlated|anticorrelated] with the frame
@@ -131,7 +131,7 @@ both    frame.{c}.lag1 series=frame.{c} frame means of the {of} are [correlated|
 both    frame.{c}.slow map=spread.{c} series=frame.{c} frame means of the {of} drift
 both    frame.{c}.trend map=trend.{c} series=frame.{c} frame means of the {of} [rise|fall] along the run
 both    frame.{c}.line series=frame.{c} the largest power in the spectrum of the frame
-        means of the {of} exceeds the model
+        means of the {of} is [above|below] that of the model
 both    frame.{c}.alternating series=frame.{c} frame means of the {of} are higher in [even|odd] frames
 both    frame.{c}.largest series=frame.{c} one frame mean of the {of} is an outlier
 both    frame.{c}.quadrants map=trend.{c} series=frame.{c} quadrants vary differently along the run in
@@ -154,9 +154,9 @@ both    space.column.{c}.variance map=y.{p} series=column.{c} column means of th
 both    space.column.{c}.lag1 map=y.{p} series=column.{c} column means of the {of} are
         [correlated|anticorrelated] with the adjacent column
 readout space.row.readout.line map=x.rr series=row.readout the largest power in the
-        spectrum of the row means of the readout residuals exceeds the model
+        spectrum of the row means of the readout residuals is [above|below] that of the model
 readout space.column.readout.line map=y.rr series=column.readout the largest power in the
-        spectrum of the column means of the readout residuals exceeds the model
+        spectrum of the column means of the readout residuals is [above|below] that of the model
 readout space.sample.readout.line readout residuals have a periodic part along rows, columns or frames
 readout space.sample.readout.spectrum readout residuals of a frame are correlated at some distance
 charge  space.x.kk map=x.kk series=row.charge electron numbers of neighbours are

@@ -34,7 +34,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args, get_origin
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -361,8 +361,12 @@ class Effect(Section):
 
     @classmethod
     def meaning(cls, name: str) -> str:
-        """Return what a parameter is: the first words of its description, without unit and further cases."""
-        return re.split(r"[,;]| \(", cls.model_fields[name].description or name, maxsplit=1)[0]
+        """Return what a number is: the first words of its description, without case and unit; or a name."""
+        field = cls.model_fields[name]
+        if get_origin(field.annotation) is Literal:
+            return name.replace("_", " ")
+        words = re.split(r"[,;]| \(", field.description or name, maxsplit=1)[0]
+        return words.rpartition(": ")[2].replace("`", "")
 
     def stuck_words(self) -> str:
         """State which parameters are at a limit; empty if none."""

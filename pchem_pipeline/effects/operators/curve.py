@@ -277,7 +277,7 @@ class AdcDnl(Effect, tag="adc_dnl"):
 
     plane = Plane.ADC
     along = 2
-    title = "differential nonlinearity of the ADC (DNL), bit weight error, missing codes"
+    title = "differential nonlinearity of the ADC (DNL, bit weight error, missing codes)"
     source = "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"
     factors = Factors("code", "all pixels", "constant")
     signature = (

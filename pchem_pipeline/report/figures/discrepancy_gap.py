@@ -86,7 +86,7 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "shown",
         "Largest deviations, before and after",
         "The largest deviations from the model, before (circles) and after effects were added (diamonds). "
-        "The gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise.",
+        "Gray: 2 sigma. Sampling noise makes the largest of some hundred 3 sigma, counts of few pixels more.",
         f"In sigma. {'; '.join(words).replace('-', '−')}.",
         (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
         _pulls_chart(rows),

@@ -55,14 +55,14 @@ _MOST_RINGS = 60
 
 
 _SCORE_WORDS = {
-    "C2": "charge: variance beyond Poisson (C2)",
-    "C3": "charge: skew beyond Poisson (C3)",
-    "He3": "readout: skew (He3)",
-    "He4": "readout: heavy tails (He4)",
-    "He2C1": "peaks widen with k (He2C1)",
-    "He1C2": "peak spacing grows with k (He1C2)",
-    "He2C2": "peak width grows faster at high k (He2C2)",
-    "He3C1": "peak skewness grows with k (He3C1)",
+    "C2": "charge: variance beyond Poisson",
+    "C3": "charge: skew beyond Poisson",
+    "He3": "readout: skew",
+    "He4": "readout: heavy tails",
+    "He2C1": "peaks widen with electron number",
+    "He1C2": "peak spacing grows with electron number",
+    "He2C2": "peak width grows faster at high electron numbers",
+    "He3C1": "peak skewness grows with electron number",
 }
 
 _PAIR_WORDS = {
@@ -168,17 +168,19 @@ class PixelMap(NamedTuple):
     region: Region | None = None  # deviating part of the sensor; None: uniform
 
 
-def regions_of(data: DiscrepancyData) -> dict[str, Region]:
-    """Return by the name of a map the region that the verdict has for it, the most significant map first."""
+def regions_of(data: DiscrepancyData) -> dict[str, Region | None]:
+    """Return maps that deviate in a region, by name, the most significant first; None: elsewhere as much."""
     placed = [each for each in data.found.where if each.region is not None and map_of(each.statistic)]
-    placed.sort(key=lambda each: each.region_p)
-    found: dict[str, Region] = {}
+    # a statistic of a part has no p-value of its region: it is not known to stand out
+    placed.sort(key=lambda each: each.region_p if math.isfinite(each.region_p) else 1.0)
+    found: dict[str, Region | None] = {}
     for each in placed:
-        found.setdefault(map_of(each.statistic), Region.model_validate(each.region))
+        outlined = math.isfinite(each.region_p)
+        found.setdefault(map_of(each.statistic), Region.model_validate(each.region) if outlined else None)
     return found
 
 
-def largest_maps(arrays: Arrays, regions: Mapping[str, Region] | None = None) -> list[PixelMap]:
+def largest_maps(arrays: Arrays, regions: Mapping[str, Region | None] | None = None) -> list[PixelMap]:
     """Return three maps: any with a deviating region, then goodness of fit, then the most deviating ones."""
     regions = regions or {}
     named = _named_maps(arrays)

@@ -21,15 +21,7 @@ from pchem_pipeline.base.wording import (
     typeset,
     unit_text,
 )
-from pchem_pipeline.discrepancy.verdict import (
-    FACTORS,
-    Place,
-    Step,
-    Verdict,
-    families_words,
-    micronats,
-    sigma_text,
-)
+from pchem_pipeline.discrepancy.verdict import FACTORS, Place, Step, Verdict, micronats, sigma_text
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.report.data import DiscrepancyData
@@ -205,8 +197,8 @@ def _parameters(data: DiscrepancyData) -> Table:
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
-        "Each with its standard error, where one was computed; names are keys of "
-        "model.effects in the run's YAML.",
+        "Each with its standard error, where one was computed; names are keys of model.effects in the run's "
+        "YAML. Sizes are simulated with these values, and have their relative errors.",
         [
             {
                 "parameter": f"{tag}: {name}",
@@ -349,7 +341,7 @@ PARTS = (
         "Identification of the effect",
         "Log-likelihood of each fitted candidate, of all statistics of training and test frames, nats; larger"
         " is better. A difference below three standard errors, where given, is not decisive.",
-        "No candidates were compared: no statistic tested disagrees with the model.",
+        "There is nothing to identify: no statistic tested disagrees with the model.",
     ),
     Section(
         "shown",
@@ -377,7 +369,7 @@ def finding(data: DiscrepancyData) -> Finding:
     found = data.found
     level, sentence = VERDICT_LEVELS.get(found.verdict, "note"), typeset(found.sentence)
     facts = key_facts(data), remarks(data)
-    return Finding(level, found.word.capitalize(), sentence, frames_text(found), *facts)
+    return Finding(level, found.word.capitalize(), sentence, found.examined.words(), *facts)
 
 
 def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
@@ -419,26 +411,6 @@ def _signature(found: Verdict) -> tuple[str, ...]:
     return next(name for start, name in _PICTURES if statistic.startswith(start)), "discrepancy_pulls"
 
 
-def frames_text(found: Verdict) -> str:
-    """Describe the samples examined."""
-    seen = found.examined
-    dealt = f"{seen.train:,} for training, {seen.test:,} for testing, {seen.final:,} for the gap"
-    if seen.histograms is not None:
-        return f"{count(seen.histograms, 'histogram')}, samples split at random: {dealt}."
-    share = f" ({percent(seen.share)} of the run's samples)" if seen.share < 1.0 else ""
-    place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
-    rest = seen.frames - seen.train - seen.test - seen.final
-    over = f"; {rest} unused" if rest > 0 else ""
-    words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt}{over}."
-    if seen.elsewhere is not None:
-        words += f" The final model was {seen.elsewhere.says()}."
-    if seen.unfitted:
-        spot = next((place for place in seen.places if place.map == "unfitted"), None)
-        where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
-        words += f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
-    return words
-
-
 def key_facts(data: DiscrepancyData) -> list[KeyFact]:
     """Return the numbers of the first screen."""
     found = data.found
@@ -451,16 +423,13 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(gap.before):
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    nats = f"{micronats(gap.before)} → {gap.after_text}" if extended else micronats(gap.before)
+    before = micronats(gap.before, gap.interval_before)
+    nats = f"{before} → {gap.after_text}" if extended else before
     unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
     if not extended or gap.after <= gap.floor:
         return [KeyFact("gap between data and model", nats, (unit, chance))]
-    low, high = gap.interval_after
-    if math.isfinite(low) and 0.0 < high < math.inf:  # of a gap below 0 nothing remains
-        chance += f"; remaining: {f'{micronats(low)} to ' if low > 0.0 else 'at most '}{micronats(high)}"
-    nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
     more = (f"{nats} {unit}", chance)
-    return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction), more)]
+    return [KeyFact(f"of the gap closed{found.closed_by}", percent(gap.closed_fraction), more)]
 
 
 def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -485,7 +454,7 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
         return []
     small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
     value = f"{_signed(largest.median)} {unit_text(largest.unit)}".strip()
-    more = f"{_signed(largest.in_stderr)} standard errors of one pixel{small}"
+    more = f"median over pixels; {_signed(largest.in_stderr)} standard errors of one pixel{small}"
     return [KeyFact(f"largest change: {_parameter_name(name)}", value, (more,))]
 
 
@@ -496,7 +465,7 @@ def _signed(value: float) -> str:
 def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
-    more = ["that the largest deviation of all statistics is chance"]
+    more = ["of the largest deviation of all statistics, if the model holds"]
     more += [f"Student's t, scatter of {found.replicates} simulated stacks"] if found.replicates else []
     before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
     value = f"{before} → {after}" if after and found.steps else before
@@ -515,8 +484,8 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
         words = "Statistics that depend on the pixels' parameters were not tested, and sizes have no e⁻"
         why = "" if found.doubt in found.sentence else f": {typeset(found.doubt)}"
         yield Flag("caution", f"{words}{why}.")
-    if extended:
-        yield from _closing(found)
+    if extended and found.gap.before <= found.gap.floor:
+        yield Flag("note", "The gap is within sampling noise before, too: only single statistics show it.")
     for step in extended:
         second = step.runner_up
         if second is not None and second.why:
@@ -535,19 +504,3 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
     if found.untestable:
         titles = ", ".join(map(data.title, found.untestable))
         yield Flag("note", f"Not testable with these data: {titles}.")
-
-
-def _closing(found: Verdict) -> Iterator[Flag]:
-    """State the remaining gap."""
-    gap = found.gap
-    if not (math.isfinite(gap.after) and math.isfinite(gap.floor)):
-        return
-    if gap.before <= gap.floor:
-        yield Flag("note", "The gap is within sampling noise before, too: only single statistics show it.")
-    elif gap.after <= gap.floor and gap.standing_out:
-        families = families_words(gap.standing_out)
-        yield Flag("caution", f"A significant discrepancy remains in {families}.")
-    elif gap.after > gap.floor:
-        words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
-        left = f"{percent(1.0 - gap.closed_fraction)} of the gap remains: {words}."
-        yield Flag("caution" if found.verdict == "named_in_part" else "note", left)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.base.wording import fitted_or_chosen, percent, typeset
+from pchem_pipeline.base.wording import count, fitted_or_chosen, percent, typeset
 from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats, sigma_text
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 
@@ -29,14 +29,13 @@ def verdict_text(found: Verdict) -> str:
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
+    lines += _wrapped(found.examined.words())
     if found.examined.left_out:
         words = frame_words(np.array(found.examined.left_out))
         lines += _wrapped(f"left out (empty, repeated, outlying or moved): {words}")
     if found.proposed:
         tags = ", ".join(str(effect["tag"]) for effect in found.proposed)
         lines += _wrapped(f"proposed, not in the model: {tags} (see proposed in discrepancy.json)")
-    if found.examined.elsewhere is not None:
-        lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:
         lines += _wrapped(f"not tested, and no sizes in e-: {found.doubt}")
     lines += _places("unexplained", found.unexplained, _MOST_LEFT)
@@ -68,11 +67,11 @@ def _spots(place: Place) -> str:
     # the sentence of a statistic of a part ends with that part
     words = [place.spot()] if place.spot() and "@" not in place.statistic else []
     if place.pixels:
-        words.append(f"{len(place.pixels)} pixels listed, first (y, x) = {place.pixels[0]}")
+        words.append(f"{count(len(place.pixels), 'pixel')} listed, first (y, x) = {place.pixels[0]}")
     if place.dn is not None:
         words.append(f"{place.dn[0]:g} to {place.dn[1]:g} DN")
     if place.frames:
-        words.append(f"{len(place.frames)} frames, first {place.frames[0]}")
+        words.append(f"{count(len(place.frames), 'frame')}, first {place.frames[0]}")
     return ", ".join(words)
 
 
@@ -94,7 +93,9 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         ]
         values += [f"{name} = {word}" for name, word in step.form.items()]
         place = f" in {step.place}" if step.place else ""
-        lines += _wrapped(f"{step.likeliest}{place}: {', '.join(values)}")
+        known = all(math.isfinite(p.stderr) for p in step.parameters.values())
+        errors = "" if known else " (those without ± have no computed error)"
+        lines += _wrapped(f"{step.likeliest}{place}: {', '.join(values)}{errors}")
     if step.effect:
         lines += [line for other in step.rivals for line in _rejected(other)]
     elif found.verdict == "ambiguous":
@@ -118,11 +119,10 @@ def _gap(found: Verdict) -> list[str]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
-    words = f"gap between data and model: {micronats(gap.before)}"
+    words = f"gap between data and model: {micronats(gap.before, gap.interval_before)}"
     if found.steps and math.isfinite(gap.after):
         words += f" → {gap.after_text}"
     words += f" micronats per sample (sampling noise: up to {micronats(gap.floor)})"
     if found.steps and gap.after > gap.floor and math.isfinite(gap.closed_fraction):
-        nearest = " by the closest effect" if found.verdict == "unexplained" else ""
-        words += f", {percent(gap.closed_fraction)} closed{nearest}"
+        words += f", {percent(gap.closed_fraction)} closed{found.closed_by}"
     return _wrapped(words)

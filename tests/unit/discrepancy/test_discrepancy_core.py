@@ -369,7 +369,9 @@ def test_what_the_likeliest_effects_have_in_common_is_certain() -> None:
 def test_a_statistic_says_what_its_sign_says() -> None:
     assert "skewed to low DN" in Place.of("shape.He3.mean", z=-17.0).sentence
     assert "skewed to high DN" in Place.of("shape.He3.mean", z=17.0).sentence
-    assert "less than the model predicts" in Place.of("space.follows.line", z=-5.0).sentence
+    assert "less than by chance" in Place.of("space.follows.line", z=-5.0).sentence
+    for statistic in ("tail.high.pixels", "shape.He4.cnt", "frame.charge.line"):  # "more ... less" is neither
+        assert "less than" not in STATISTICS[statistic].says(-5.0)
     part = STATISTICS["space.x.rr@columns=24:28"]
     assert "anticorrelated, along x, in columns 24 to 27" in part.says(-5.0)
 
@@ -408,6 +410,11 @@ def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
     assert STATISTICS[NAMES[7]].sentence in _sentence(found, {})
     calm = replace(found, still=False)
     assert calm.state == "named"
+    # the gap shows what no statistic by itself does
+    rest = Gap(3.6e-5, 3e-5, (1.64e-5, 5.56e-5), {})
+    part = replace(calm, added=Added((addition,), rest))
+    words = "40 % of the discrepancy remains, in no single statistic (36 ± 10 micronats per sample, sampling"
+    assert (part.state, words in _sentence(part, {})) == ("named_in_part", True)
     assert STATISTICS[NAMES[7]].sentence not in _sentence(calm, {})
 
 

@@ -58,12 +58,13 @@ def test_the_size_in_a_part_is_that_where_it_acts_and_there_is_none_without_usab
 
 def test_a_size_is_told_with_the_samples_that_change() -> None:
     for (electrons, dn, of_read_noise, samples), words in (
-        ((0.039, 0.61, 0.11, 1.0), "samples change by 0.61 DN rms, 11 % of the read noise"),
+        ((0.039, 0.61, 0.11, 1.0), "samples change by 0.61 DN rms, 11 % of the median read noise"),
         (
             (213.0, 2028.0, 831.06, 0.0081),
-            "0.81 % of samples change by 2028 DN rms, 831 times the read noise",
+            "0.81 % of the samples in its region and frames change by 2028 DN rms, 831 times the median read "
+            "noise",
         ),
-        ((1.1, 12.0, 3.41, 1.0), "samples change by 12 DN rms, 3.4 times the read noise"),
+        ((1.1, 12.0, 3.41, 1.0), "samples change by 12 DN rms, 3.4 times the median read noise"),
     ):
         size = Size(electrons=electrons, dn=dn, of_read_noise=of_read_noise, samples=samples)
         assert size.words() == words

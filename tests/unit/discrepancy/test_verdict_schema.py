@@ -14,6 +14,7 @@ from pchem_pipeline.discrepancy.verdict import (
     Place,
     Verdict,
     form_of,
+    micronats,
     parameters_of,
     read_verdict,
 )
@@ -46,6 +47,12 @@ def test_numbers_that_are_not_known_are_null_in_the_file() -> None:
     content = json.loads(verdict_of("named", gap=gap).to_json())
     assert content["gap"]["floor"] is content["gap"]["after"] is None
     assert math.isnan(Verdict.from_json(json.dumps(content)).gap.floor)
+
+
+def test_a_gap_has_the_standard_error_of_its_interval() -> None:
+    assert micronats(15989e-6, (15645e-6, 16333e-6)) == "15,989 ± 176"
+    assert micronats(-5.3e-6, (-2.13e-5, 1.07e-5)) == "−5.3 ± 8.2"
+    assert (micronats(-5.3e-6), micronats(2541e-6), micronats(math.nan)) == ("0", "2,541", "not known")
 
 
 @pytest.mark.parametrize("version", [1, SCHEMA_VERSION - 1, SCHEMA_VERSION + 1])
@@ -141,6 +148,19 @@ def test_a_wave_along_rows_has_a_frequency_where_the_time_of_a_row_is_known() ->
     assert (round(frequency.value), round(frequency.stderr), frequency.unit) == (17_000, 20, "Hz")
     assert timed.steps[:-1] == found.steps
     assert Verdict.from_json(timed.to_json()).steps[-1].parameters["frequency"] == frequency
+
+
+@pytest.mark.parametrize(
+    ("tag", "name", "words"),
+    [
+        ("adc_inl", "phase", "phase at 0 DN"),
+        ("adc_dnl", "first_code", "code of the first of edges"),
+        ("adc_dnl", "pattern", "pattern"),
+        ("row_noise", "row_noise_dn", "standard deviation of the rows' offsets"),
+    ],
+)
+def test_a_number_says_what_it_is_and_a_text_has_its_name(tag: str, name: str, words: str) -> None:
+    assert effect_class(tag).meaning(name) == words
 
 
 def test_the_form_of_an_effect_is_told_where_it_is_not_the_usual_one() -> None:

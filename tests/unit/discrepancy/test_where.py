@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.discrepancy.where import (
+    _codes,
+    _frames,
     _pixels,
     frame_series,
     map_of,
@@ -100,6 +103,18 @@ def test_pixels_whose_levels_wander_are_listed_and_no_others() -> None:
     evidence = seen(moved)
     names = ("time.block.charge.cnt", "time.block.readout.cnt")
     assert {p for name in names for p in _pixels(name, evidence, pixel_maps(evidence))} == {(30, 60), (36, 7)}
+
+
+def test_an_outlying_code_is_one_code_and_no_frame() -> None:
+    evidence = seen()
+    code = replace(evidence.code, observed=evidence.code.observed.copy())
+    code.observed[20:24] += [400.0, 900.0, 800.0, 400.0]
+    evidence = replace(evidence, code=code)
+    assert _codes("code.largest", evidence) == (code.first + 21, code.first + 21)
+    low, high = _codes("code.smooth", evidence) or (0, 0)
+    assert low < high
+    assert _frames("code.largest", evidence) == ()
+    assert len(_frames("frame.charge.largest", evidence)) == 1
 
 
 def test_a_place_counts_from_the_corner_of_the_sensor() -> None:

@@ -31,13 +31,7 @@ from pchem_pipeline.report.figures.catalogue import discrepancy_figures
 from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
 from pchem_pipeline.report.figures.discrepancy_where import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages.discrepancy import (
-    discrepancy_tables,
-    frames_text,
-    key_facts,
-    place_text,
-    remarks,
-)
+from pchem_pipeline.report.pages.discrepancy import discrepancy_tables, key_facts, place_text, remarks
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.style.palette import LIGHT
@@ -152,6 +146,7 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
             {"elsewhere": {"rows": [8, 16], "columns": [0, 8]}},
             " The final model was tested again in rows 8 to 15, columns 0 to 7: the model holds.",
         ),
+        ({"compared": 31}, "; 31 of the known effects compared."),
         ({"unfitted": 7}, " Not compared: 7 pixels without a reliable fit."),
         (
             {"unfitted": 7, "places": [{"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}]},
@@ -162,10 +157,9 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
 def test_what_was_looked_at_is_told(examined: dict[str, Any], words: str) -> None:
     seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320}
     found = discrepancy_data("named", examined={**seen, **examined}).found
-    assert frames_text(found).endswith(words)
-    assert ("unused" in frames_text(found)) == ("frames" in examined)
-    again = words.removeprefix(" The final model was ").removesuffix(".")
-    assert "elsewhere" not in examined or again in verdict_text(found)
+    assert found.examined.words().endswith(words)
+    assert ("unused" in found.examined.words()) == ("frames" in examined)
+    assert words in " ".join(verdict_text(found).split())
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -297,7 +291,7 @@ def outlined(figure: Figure) -> int:
 def test_a_map_with_a_place_comes_first_with_its_outline(end: int) -> None:
     data = discrepancy_data("named")
     usual = [each.title for each in largest_maps(data.arrays)[:2]]
-    assert (usual[0].startswith("goodness of fit"), usual[1]) == (True, "readout: heavy tails (He4)")
+    assert (usual[0].startswith("goodness of fit"), usual[1]) == (True, "readout: heavy tails")
     assert largest_maps({}) == []
     _, x = data.found.examined.origin
     place = Place.of("space.x.rr", 20.0, region={"columns": [[x + 3, x + end]]}, region_p=1e-30)
@@ -308,6 +302,9 @@ def test_a_map_with_a_place_comes_first_with_its_outline(end: int) -> None:
     figure = next(each for each in discrepancy_figures(placed) if each.name == "discrepancy_maps")
     assert place_text(place) == f"mainly in columns {x + 3} to {x + end - 1}"
     assert place_text(place) in figure.alt
+    part = Place.of("space.x.rr@columns=3:7", 20.0, region={"columns": [[3, 7]]})  # not tested to stand out
+    shown = regions_of(replace(data, found=found.model_copy(update={"where": (part,)})))
+    assert shown == {"x.rr": None}  # drawn without its outline
     # two edges of each row and two of each column
     rows, columns = first.z.shape
     assert outlined(figure) == 2 * rows + 2 * (min(end, columns) - 3)
@@ -374,14 +371,14 @@ def test_pulls_come_from_the_steps_or_from_the_vectors() -> None:
     assert largest_pulls(discrepancy_data("named", steps=[placed]))[0].sentence == "in a part"
 
 
-def test_what_is_left_of_the_gap_is_a_caution_and_one_that_chance_makes_is_not_said_to_be_closed() -> None:
-    data, gap = discrepancy_data("named"), result("named")["gap"]
-    part = {flag.text: flag.level for flag in remarks(replace(data, found=verdict_of("named_in_part")))}
-    assert [level for text, level in part.items() if "of the gap remains" in text] == ["caution"]
-    closed = replace(data, found=verdict_of("named", gap={**gap, "after": 0.5e-6}))
-    assert not [flag for flag in remarks(closed) if "gap remains" in flag.text]
+def test_a_gap_that_is_left_has_its_error_and_one_that_chance_makes_is_not_said_to_be_closed() -> None:
+    gap = result("named")["gap"]
+    part = {fact.label: fact for fact in key_facts(discrepancy_data("named_in_part"))}["of the gap closed"]
+    # half of 1.6 - 0.5 times the gap, 95 % of its values, is 1.96 standard errors
+    assert (part.value, part.more[0]) == ("94 %", "477 → 31.0 ± 8.7 micronats per sample")
     weak = {**step("row_noise", "named", 0.6, 0.0), "gap_floor": 1e-6}
-    chance = {**gap, "before": 0.6e-6, "after": 0.0, "floor": 1e-6, "closed_fraction": 1.0}
+    ends = {"interval_before": [-1e-6, 2.2e-6], "interval_after": [-2e-6, 2e-6]}
+    chance = {**gap, **ends, "before": 0.6e-6, "after": 0.0, "floor": 1e-6}
     data = discrepancy_data("named", steps=[weak], gap=chance, doubt="the bias of 93 % may be off")
     told = {flag.text: flag.level for flag in remarks(data)}
     assert not any("leaves a gap" in text for text in told)
@@ -390,7 +387,7 @@ def test_what_is_left_of_the_gap_is_a_caution_and_one_that_chance_makes_is_not_s
     assert not any("no size is given" in text for text in told)
     facts = {fact.label: fact for fact in key_facts(data)}
     assert "of the gap closed" not in facts
-    assert facts["gap between data and model"].value == "0.6 → 0"
+    assert facts["gap between data and model"].value == "0.60 ± 0.82 → 0.0 ± 1.0"
 
 
 def test_a_named_effect_says_why_no_other_one_and_where_it_is() -> None:

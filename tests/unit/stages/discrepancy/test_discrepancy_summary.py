@@ -81,8 +81,9 @@ def test_numbers_that_are_not_known_are_said_so_and_a_single_candidate_has_no_pr
 def test_a_gap_that_chance_makes_is_not_said_to_be_closed():
     weak = {**step("row_noise", "named", 0.6, 0.0), "gap_floor": 1e-6}
     gap = {**verdict_of("named").gap.model_dump(), "before": 0.6e-6, "after": 0.0, "floor": 1e-6}
+    gap["interval_after"] = [-2e-6, 2e-6]
     text = words_of("named", steps=[weak], gap=gap)
-    assert "gap between data and model: 0.6 → 0 micronats per sample (sampling noise: up to 1)" in text
+    assert "model: 0.6 → 0.0 ± 1.0 micronats per sample (sampling noise: up to 1)" in text
     assert "closed" not in text
     assert "instead of" not in text
 

@@ -740,6 +740,8 @@ def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands
     for each in additions:
         closed = each.before.value - each.after.value
         assert closed > 0.0
+        # nothing is rejected that is named, nor twice
+        assert [rival.effect for rival in each.rivals] == ["exposure_drift"]
         [rival] = [rival for rival in each.rivals if rival.effect == "exposure_drift"]
         # nothing of it is in the data: it closes nothing; the other strength is settled to 5 %
         assert -0.1 * closed < rival.gap_after - each.before.value < 0.5 * closed
