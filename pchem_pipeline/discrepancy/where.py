@@ -156,9 +156,15 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
             total, number = variance.sum(axis=axis), usable.sum(axis=axis)
             some = total > 0
             if some.sum() > 2:
-                u = getattr(time, f"{line}_{channel}")[:, some] * number[some] / np.sqrt(total[some])
-                u = u - u.mean(axis=1, keepdims=True)
-                found[f"{line}.{channel}"] = np.asarray(chi_square((u**2).sum(axis=1), some.sum() - 1.0))
+                # not each over its own error: an electron in a dark line would be many of these
+                sums, share = (
+                    getattr(time, f"{line}_{channel}")[:, some] * number[some],
+                    total[some] / total.sum(),
+                )
+                apart = sums - np.outer(sums.sum(axis=1), share)
+                covariance = total.sum() * (np.diag(share) - np.outer(share, share))
+                law = np.trace(covariance), 2.0 * np.sum(covariance**2)
+                found[f"{line}.{channel}"] = np.asarray(chi_square((apart**2).sum(axis=1), *law))
     return found
 
 

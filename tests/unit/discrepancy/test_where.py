@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.plain_camera import PlainCamera
 from helpers.quick_stacks import added, stack
 
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -76,6 +77,18 @@ def test_frames_that_are_noisier_in_every_sample_by_itself_are_told() -> None:
     found = suspected_frames(seen(added(np.s_[200:280], 0.8 * NOISE((80, *PIXELS)))))
     [[first, last]] = found["frame.noise"][0].when.numbers()["range"]
     assert abs(first - 200) + abs(last - 280) <= 8
+
+
+def test_an_electron_in_a_dark_row_makes_no_frame_stand_out() -> None:
+    n = 8000
+    frames = PlainCamera(0.4, 5.0, 8.2, (16, 16), n, layout="overscan").frames(1)
+    evidence = observe(frames, np.arange(n), n_run=n, block_frames=100)
+    assert evidence.maps.usable[:2].any()
+    for line in ("row", "column"):
+        values = frame_series(evidence)[f"{line}.charge"]
+        # the largest of so many normal numbers is beyond 5.5 once in 3,000
+        assert np.abs(values).max() < 5.5
+        assert abs(values.std() - 1.0) < 0.1
 
 
 def test_clean_frames_have_no_place_and_no_time_and_their_maps_and_series_are_standard_normal() -> None:
