@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
@@ -24,35 +21,6 @@ Camera = Callable[[int], NDArray[np.unsignedinteger]]
 _BLOCK = 50  # frames, as many as a search looks at in one piece
 
 
-@dataclass(frozen=True)
-class RecoveredStrength:
-    """The true strength, and that of the likeliest hypothesis in each of n stacks, NaN without any."""
-
-    true: float
-    found: FloatArray
-
-    @property
-    def n_guesses(self) -> int:
-        """Number of stacks in which the estimator has a hypothesis."""
-        return int(np.isfinite(self.found).sum())
-
-    @property
-    def mean(self) -> float:
-        """Mean strength found; NaN where one stack has no hypothesis."""
-        return float(self.found.mean())
-
-    @property
-    def standard_error(self) -> float:
-        """Standard error of the mean, from the scatter between the stacks."""
-        return float(self.found.std(ddof=1) / math.sqrt(self.found.size))
-
-    @property
-    def probability(self) -> float:
-        """Chance that an estimator without bias is off by as much (Student's t); NaN as the mean is."""
-        t = abs(self.mean - self.true) / self.standard_error
-        return 2.0 * float(stdtr(self.found.size - 1, -t))
-
-
 def recovered_strength(
     effect: Effect,
     *,
@@ -61,8 +29,8 @@ def recovered_strength(
     n_frames: int = 1500,
     shape: tuple[int, int] = (20, 20),
     seed: int = 1,
-) -> RecoveredStrength:
-    """Return the strengths that the estimator of an effect finds in stacks of simulated frames.
+) -> FloatArray:
+    """Return the strength of the first guess of an estimator in each of n stacks of frames, NaN without any.
 
     Each stack is of another sensor, drawn as ``pchem simulate`` draws it, and is looked at as a search looks
     at frames: histograms, plain fits, statistics.
@@ -92,7 +60,7 @@ def recovered_strength(
         hypotheses = type(effect).estimate(evidence)
         if hypotheses:
             found[i] = getattr(hypotheses[0], effect.strength)
-    return RecoveredStrength(float(getattr(effect, effect.strength)), found)
+    return found
 
 
 def _check_reach(effect: Effect, shape: tuple[int, int], seed: int) -> None:
