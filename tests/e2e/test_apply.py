@@ -373,10 +373,10 @@ def test_the_run_of_a_folder_is_chosen_by_camera_setting_and_date(lab, night):
     assert "taken 88.0 days before the frames" in words
     words = lab.refused(2, "apply", "runs/old.zarr", "dated.tif", *output, "--max-age", "1")
     assert "is no folder of finished runs" in words
-    shutil.copytree(runs / "old.zarr", runs / "again.zarr")
+    shutil.copytree(runs / "old.zarr", runs / "more" / "old.zarr")
     words = refused(lab, "runs", "dated.tif", *output)
-    assert "again.zarr and old.zarr in runs were taken at the same time; name one" in words
-    shutil.rmtree(runs / "again.zarr")
+    assert "more/old.zarr and old.zarr in runs were taken at the same time; name one" in words
+    shutil.rmtree(runs / "more")
     night_file(lab, "undated.tif", **record)
     words = refused(lab, "runs", "undated.tif", *output)
     assert "without a date, so none of new.zarr, old.zarr can be chosen" in words

@@ -151,8 +151,7 @@ def _make_job(
     remarks = check_camera(frames, sensor) + check_level(some - drift, calibration, frames.paths[0])
     if why := open_gain(calibration.fit_status):
         remarks.append(
-            f"{target.store.name}: {why}; electrons and errors can be far off; take several exposures (pchem "
-            "joint)"
+            f"{target.store.name}: {why}: values and errors can be far off; take several exposures"
         )
     if kept:
         remarks.append(
