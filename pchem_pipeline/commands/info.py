@@ -67,7 +67,7 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
         frames = joined(readers, report, settings, here, least=1)
         yield _stack_words(frames)
         yield f"in a run, {disk_words(RunConfig(input=settings), frames)}"
-        yield from dict.fromkeys((*frames.notes, *frames.report.notes))
+        yield from dict.fromkeys(report.notes)
     except InputError as error:
         yield f"together no stack: {error}"
 

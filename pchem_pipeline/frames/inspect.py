@@ -11,7 +11,7 @@ from typing import Literal
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
-from pchem_pipeline.frames.reader import FrameReader, shared_notes, sound
+from pchem_pipeline.frames.reader import FrameReader, said_once, shared_notes, sound
 from pchem_pipeline.frames.registry import detect_format, reader_class
 from pchem_pipeline.frames.resolve import resolve_files
 from pchem_pipeline.frames.settings import InputSettings
@@ -53,14 +53,14 @@ class InputReport:
         lines = []
         if bad := self.bad:
             several = f"{len(bad)} of {len(self.files)} input files cannot be used: "
-            listed = "; ".join(f"{file.path}: {file.problem}" for file in bad)
+            listed = "; ".join(said_once((str(file.path), file.problem or "") for file in bad))
             lines += [(several if len(self.files) > 1 else "") + listed, done]
         return "; ".join(filter(None, lines + self.notes))
 
     def raise_if_refused(self, on_bad_file: Literal["error", "skip"]) -> None:
         """Raise InputError if there are bad files that are not to be skipped, or no good ones are left."""
         if self.bad and (on_bad_file == "error" or not self.good):
-            cure = "" if len(self.files) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
+            cure = "; repair or remove them, or set input.on_bad_file: skip" if self.good else ""
             raise InputError(self.message("") + cure)
 
 

@@ -7,7 +7,7 @@ Readers from elsewhere come through the entry point group ``pchem_pipeline.reade
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -143,18 +143,22 @@ def check_window(
 
 
 def shared_notes(readers: Sequence[FrameReader]) -> list[str]:
-    """Return the remarks on all files; one that many share stands once, with the name of the first."""
+    """Return the remarks on all files; one that many share stands once."""
+    notes = [(reader.paths[0].name, note) for reader in readers for note in dict.fromkeys(reader.notes)]
+    return said_once(
+        (name if note.startswith(f"{name}: ") else "", note.removeprefix(f"{name}: ")) for name, note in notes
+    )
+
+
+def said_once(said: Iterable[tuple[str, str]]) -> list[str]:
+    """Return what is said of files, all alike once, with the name of the first unless that is empty."""
     names: dict[str, list[str]] = {}
-    for reader in readers:
-        for note in dict.fromkeys(reader.notes):
-            name = f"{reader.paths[0].name}: "
-            about = [name] if note.startswith(name) else []
-            names.setdefault(note.removeprefix(name), []).extend(about)
-    notes = []
-    for words, about in names.items():
-        more = f" and {len(about) - 1} more: " if len(about) > 1 else ": "
-        notes.append(about[0].removesuffix(": ") + more + words if about else words)
-    return notes
+    for name, words in said:
+        names.setdefault(words, []).append(name)
+    return [
+        (f"{first}{f' and {len(others)} more' if others else ''}: " if first else "") + words
+        for words, (first, *others) in names.items()
+    ]
 
 
 def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks") -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.identity import SCRATCH_BYTES
 from pchem_pipeline.frames.inspect import InputReport
-from pchem_pipeline.frames.reader import FrameReader, check_window, described, shared_notes, sound
+from pchem_pipeline.frames.reader import FrameReader, check_window, described, sound
 from pchem_pipeline.frames.settings import Area, InputSettings
 
 
@@ -122,7 +122,10 @@ class FrameSequence(FrameReader):
             self.timestamps = np.concatenate(stamps)[self._first : end]
         _check_same_camera(readers)
         self.camera, moved = shared_facts([reader.camera for reader in readers])
-        self.notes = (*shared_notes(readers), *([moved] if moved else []))
+        dates = [(each.camera.taken, each.paths[0].name) for each in readers if each.camera.taken is not None]
+        self.last_taken = max(dates, default=(None,))[0]
+        self.moved = [*filter(None, [moved, _pause(sorted(dates))])]
+        self.report.notes += self.moved
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
@@ -295,6 +298,18 @@ def _where(paths: Sequence[Path]) -> str:
     return str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
 
 
+def _pause(dates: Sequence[tuple[float, str]]) -> str:
+    """Return a remark on the longest pause between files, if above an hour and ten usual ones; else empty."""
+    steps = np.diff([taken for taken, _ in dates])
+    if not steps.size or steps.max() <= max(3600.0, 10.0 * np.median(steps)):
+        return ""
+    last = int(steps.argmax())
+    return (
+        f"a pause of {steps[last] / 3600.0:.3g} h between {dates[last][1]} and {dates[last + 1][1]}: offset, "
+        "dark current and light may have changed"
+    )
+
+
 def _check_same_camera(readers: Sequence[FrameReader]) -> None:
     """Refuse files of different cameras or settings: their frames are no samples of one distribution."""
     for name in dict.fromkeys(name for reader in readers for name in reader.camera.setup):
@@ -327,12 +342,12 @@ def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
 
 
 def _first_of_each(values: Mapping[str, Any], what: str = "") -> str:
-    """Return the first values that differ, each with its first file and the number of the others."""
+    """Return the first values that differ, each with its files, of many the first and their number."""
     seen: dict[Any, list[str]] = {}
     for file, value in values.items():
         seen.setdefault(value, []).append(file)
     return ", ".join(
-        f"{what}{value} in {files[0]}" + (f" and {len(files) - 1} more" if len(files) > 1 else "")
+        f"{what}{value} in {' and '.join(files if len(files) < 5 else (files[0], f'{len(files) - 1} more'))}"
         for value, files in [*seen.items()][:4]
     )
 

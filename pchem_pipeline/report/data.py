@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, flags_of
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, flagged, flagged_share
 from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
@@ -224,11 +224,11 @@ class ReportData:
 
     def flagged_in(self, name: str) -> BoolArray:
         """Return which pixels the data leave open in one map: a gain is known where the bias is not."""
-        return np.asarray(~self.failed & (self.status & int(flags_of(name)) != 0))
+        return flagged(self.status, name)
 
     def flagged_share(self, name: str = "quanta_exposure") -> float:
         """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
-        return int(self.flagged_in(name).sum()) / max(int((~self.failed).sum()), 1)
+        return flagged_share(self.status, name)
 
     @property
     def mostly_flagged(self) -> bool:

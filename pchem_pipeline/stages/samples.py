@@ -164,7 +164,8 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
         if x[i] <= x[last]:
             raise ConfigError(
                 f"{samples[i].where}: {what} {x[i]:g} is not above {x[last]:g} of {samples[last].where}; "
-                f"list the samples in increasing order of {what}"
+                f"list the samples in increasing order of {what}; of equal ones give the levels of the lamp "
+                "(pchem joint RUNS --level 0,1) or fit without a slope (--against none)"
             )
     if len(exposed) < 2:
         raise ConfigError(

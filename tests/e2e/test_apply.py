@@ -19,6 +19,7 @@ from helpers.without_pictures import undrawn
 
 from pchem_pipeline.commands.apply.characterisation import read_calibration
 from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.run_store import RunStore
@@ -367,12 +368,15 @@ def test_the_run_of_a_folder_is_chosen_by_camera_setting_and_date(lab, night):
     output = ("--output", "out.zarr")
     words = refused(lab, "runs", "dated.tif", *output, "--max-age", "1")
     assert "taken 2.0 days after the frames, more than --max-age 1" in words
+    night_file(lab, "late.tif", date="2026-03-30", **record)
+    words = refused(lab, "runs", "dated.tif", "late.tif", *output, "--max-age", "50")
+    assert "taken 88.0 days before the frames" in words
     words = lab.refused(2, "apply", "runs/old.zarr", "dated.tif", *output, "--max-age", "1")
     assert "is no folder of finished runs" in words
-    shutil.copytree(runs / "old.zarr", runs / "again.zarr")
+    shutil.copytree(runs / "old.zarr", runs / "more" / "old.zarr")
     words = refused(lab, "runs", "dated.tif", *output)
-    assert "again.zarr and old.zarr in runs were taken at the same time; name one" in words
-    shutil.rmtree(runs / "again.zarr")
+    assert "more/old.zarr and old.zarr in runs were taken at the same time; name one" in words
+    shutil.rmtree(runs / "more")
     night_file(lab, "undated.tif", **record)
     words = refused(lab, "runs", "undated.tif", *output)
     assert "without a date, so none of new.zarr, old.zarr can be chosen" in words
@@ -380,6 +384,14 @@ def test_the_run_of_a_folder_is_chosen_by_camera_setting_and_date(lab, night):
     words = refused(lab, "runs", "set.tif", *output)
     assert "no run in runs fits" in words
     assert "high.zarr: gain = 5, but the run has 10" in words
+    unfit = RunStore.open(runs / "high.zarr", writable=True)
+    status = unfit.read("fit/fit_status")
+    unfit.write_array("fit/fit_status", status | np.uint16(FitStatus.GAIN_AMBIGUOUS))
+    night_file(lab, "open.tif", **(record | {"gain": 10}))
+    words = refused(lab, "runs", "open.tif", *output)
+    assert "high.zarr: the frames do not fix the gain of 100 % of the pixels" in words
+    done = lab.ok("apply", "runs/high.zarr", "open.tif", *output)
+    assert "high.zarr: the frames do not fix the gain of 100 % of the pixels" in done.stderr
 
 
 def applied(shell, rng, camera, exposure, n_frames, until, n_night):

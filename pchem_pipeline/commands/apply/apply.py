@@ -30,6 +30,7 @@ from pchem_pipeline.commands.apply.source import (
     check_camera,
     check_level,
     limits_of,
+    open_gain,
     open_like_run,
     overscan_of,
     some_of,
@@ -148,6 +149,10 @@ def _make_job(
     # a bias that moved is measured in the overscan
     drift = 0.0 if overscan is None else float(np.nanmean(some.mean(axis=0) - overscan.bias))
     remarks = check_camera(frames, sensor) + check_level(some - drift, calibration, frames.paths[0])
+    if why := open_gain(calibration.fit_status):
+        remarks.append(
+            f"{target.store.name}: {why}: values and errors can be far off; take several exposures"
+        )
     if kept:
         remarks.append(
             f"{kept} not subtracted: {100 * cut:.0f} % of the samples are at a limit of the ADC, which hides "

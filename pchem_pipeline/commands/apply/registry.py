@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
-from pchem_pipeline.commands.apply.source import MOST_WARMER, unlike, warmer
+from pchem_pipeline.commands.apply.source import MOST_WARMER, open_gain, unlike, warmer
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.sensor import SensorInfo
@@ -47,11 +47,12 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
     for path, sensor in runs.items():
         why = unlike(camera, sensor.camera)
         if not {sensor.shape, sensor.whole} & shapes:
-            why = f"{sensor.ny} x {sensor.nx} pixels"
+            why = f"{sensor.ny} x {sensor.nx} pixels, but {' x '.join(map(str, frames.whole_shape))} here"
         if abs(warmer(camera, sensor.camera)) > MOST_WARMER:
-            why = f"sensor at {sensor.camera.temperature:.4g} °C"
+            why = f"sensor at {sensor.camera.temperature:.4g} °C, but {camera.temperature:.4g} °C here"
+        why = why or open_gain(RunStore.open(path).read("fit/fit_status"))
         if why:
-            against.append(f"{path.name}: {why}")
+            against.append(f"{path.relative_to(target)}: {why}")
         else:
             fitting[path] = sensor.camera.taken
     if not fitting:
@@ -62,11 +63,12 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
         return next(iter(fitting)), "the only one of this camera and setting"
     dated = [(taken - camera.taken, path) for path, taken in fitting.items() if taken and camera.taken]
     if len(dated) < len(fitting):
-        listed = ", ".join(path.name for path in fitting)
+        listed = ", ".join(str(path.relative_to(target)) for path in fitting)
         raise InputError(f"{name}: files or runs without a date, so none of {listed} can be chosen; name one")
     age, path = max((each for each in dated if each[0] <= 0.0), default=min(dated))
-    if len(same := [other.name for other_age, other in dated if other_age == age]) > 1:
+    if len(same := [str(other.relative_to(target)) for other_age, other in dated if other_age == age]) > 1:
         raise InputError(f"{' and '.join(same)} in {target} were taken at the same time; name one")
+    age = max(age, age + (camera.taken or 0.0) - (frames.last_taken or 0.0), key=abs)  # of the farthest file
     days = abs(age) / 86_400.0
     words = f"{days:.1f} days {'before' if age <= 0.0 else 'after'} the frames"
     if max_age is not None and days > max_age:

@@ -16,6 +16,7 @@ from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.model.fit.status import flagged_share
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.overscan import read_overscan
@@ -132,6 +133,12 @@ def unlike(here: CameraFacts, there: CameraFacts) -> str:
     return ""
 
 
+def open_gain(fit_status: NDArray[np.integer[Any]]) -> str:
+    """Return in words that the gain of most pixels is open; else empty."""
+    share = flagged_share(fit_status, "conversion_gain")
+    return f"the frames do not fix the gain of {100 * share:.0f} % of the pixels" if share > 0.5 else ""
+
+
 def warmer(here: CameraFacts, there: CameraFacts) -> float:
     """Return by how much a sensor is warmer than another time, K; 0 where that is not known."""
     if here.temperature is None or there.temperature is None:
@@ -148,7 +155,7 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
     here, there = frames.camera, sensor.camera
     if why := unlike(here, there):
         raise InputError(f"{frames.paths[0]}: {why}; give a run of the same camera and setting")
-    remarks = []
+    remarks = list(frames.moved)
     if here.name and there.name and here.name.casefold() != there.name.casefold():
         remarks.append(f"camera {here.name}, but {there.name} in the run")
     if abs(warmer(here, there)) > MOST_WARMER:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from enum import IntFlag
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.variables import CHARGE_RATES
@@ -63,6 +65,16 @@ def flags_of(name: str) -> FitStatus:
     """Return the bits of pixels that medians and tables of a map leave out; its name without ``_stderr``."""
     of_bias = FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE
     return FLAGGED if name in _COUNTS_ELECTRONS else FLAGGED & ~of_bias
+
+
+def flagged(words: NDArray[np.integer[Any]], name: str) -> BoolArray:
+    """Return which pixels with a value the data leave open in a map, of status words of any shape."""
+    return np.asarray((words & int(FAILED) == 0) & (words & int(flags_of(name)) != 0))
+
+
+def flagged_share(words: NDArray[np.integer[Any]], name: str) -> float:
+    """Return the share of these pixels among those with a value."""
+    return int(flagged(words, name).sum()) / max(int((words & int(FAILED) == 0).sum()), 1)
 
 
 def with_rivals_named(words: IntArray, *, dark: bool, several: bool = False) -> IntArray:

@@ -115,7 +115,7 @@ def _gain_spread(data: ReportData) -> _Found:
 _MEASURES: dict[str, tuple[Callable[[ReportData], _Found], Callable[[float], str]]] = {
     "read_noise_e": (_read_noise, lambda value: f"{short(value)} e⁻"),
     "failed_pixels": (_failed, percent),
-    "flagged_pixels": (lambda data: (float(data.flagged.mean()), f"flagged {data.noun}s"), percent),
+    "flagged_pixels": (lambda data: (data.flagged_share(), f"flagged {data.noun}s"), percent),
     "hot_pixels": (_hot, percent),
     "outlying_pixels": (_outlying, percent),
     "gain_nonuniformity": (_gain_spread, percent),

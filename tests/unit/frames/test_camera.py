@@ -116,10 +116,19 @@ def test_several_files_share_what_they_state_alike(tmp_path):
         write_fits(tmp_path / f"{i}.fits", STACK[i], INSTRUME="C", **cards)
     frames = opened(tmp_path / "*.fits")
     assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
-    assert [note for note in frames.notes if "-20.4 to -17 °C" in note]
+    assert [note for note in frames.report.notes if "-20.4 to -17 °C" in note]
     steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
     assert (steady.temperature, remark) == (1.45, "")
     assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
+
+
+def test_a_pause_between_files_is_told(tmp_path):
+    for i, time in enumerate(("01T23:50:00", "01T23:50:10", "03T01:50:10", "03T01:50:20")):
+        write_fits(tmp_path / f"{i}.fits", STACK[i], **{"DATE-OBS": f"2026-02-{time}"})
+    frames = opened(tmp_path / "*.fits")
+    assert [note for note in frames.report.notes if "a pause of 26 h between 1.fits and 2.fits" in note]
+    assert frames.last_taken - frames.camera.taken == 93_620.0
+    assert opened(tmp_path / "[02]*.fits").moved == []  # the usual step
 
 
 def test_files_of_two_cameras_are_no_stack(tmp_path):
@@ -127,7 +136,7 @@ def test_files_of_two_cameras_are_no_stack(tmp_path):
         write_fits(tmp_path / f"{i}.fits", STACK[i], SERIALNO=serial)
     words = r"different cameras: serial number A1 in {}, serial number B2 in {}; give those of one at"
     for files, a, b in (
-        (("*.fits",), r"0\.fits and 1 more", r"2\.fits and 1 more"),
+        (("*.fits",), r"0\.fits and 1\.fits", r"2\.fits and 3\.fits"),
         (("1.fits", "2.fits"), r"1\.fits", r"2\.fits"),
     ):
         with pytest.raises(InputError, match=words.format(a, b)):
@@ -140,7 +149,7 @@ def test_files_of_two_cameras_are_no_stack(tmp_path):
 def test_files_of_two_settings_are_no_stack(tmp_path):
     for i, (gain, kind) in enumerate(((0, "DARK"), (0, "DARK"), (10, "DARK"), (0, "LIGHT"))):
         write_fits(tmp_path / f"{i}.fits", STACK[i], GAIN=gain, READMODE="fast", IMAGETYP=kind)
-    words = r"different settings: GAIN = 0 in 0\.fits and 2 more, GAIN = 10 in 2\.fits; give those of one"
+    words = r"different settings: GAIN = 0 in 0\.fits and 1\.fits and 3\.fits, GAIN = 10 in 2\.fits; give"
     not_opened(words, tmp_path / "*.fits")
     with pytest.raises(InputError, match=r"IMAGETYP = DARK in 0\.fits, IMAGETYP = LIGHT in 3\.fits"):
         open_frames(InputSettings(files=("0.fits", "3.fits")), tmp_path)

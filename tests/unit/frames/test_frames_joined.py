@@ -142,7 +142,7 @@ def test_bit_shift_and_bit_depth(tmp_path):
 def test_files_that_contradict_each_other(tmp_path):
     for i, time in enumerate((1.5, 1.5, 2.0)):
         write_fits(tmp_path / f"f{i}.fits", STACK[i], EXPTIME=time)
-    words = r"different integration_time: 1\.5 in f0\.fits and 1 more, 2\.0 in f2\.fits"
+    words = r"different integration_time: 1\.5 in f0\.fits and f1\.fits, 2\.0 in f2\.fits"
     not_opened(words, tmp_path / "*.fits")
     assert opened(tmp_path / "*.fits", integration_time=3.0).integration_time == 3.0
     fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
@@ -188,6 +188,9 @@ def test_one_message_lists_all_bad_files(tmp_path):
     assert "skipped (input.on_bad_file: skip)" in reader.report.message()
     assert [file.path.name for file in reader.report.good] == [f"f{i}.tif" for i in range(5)]
     assert len(reader.report.bad) == 8
+    tifffile.imwrite(tmp_path / "f90.tif", STACK[0].astype(np.float32), photometric="minisblack")
+    found = r"2 of 2 input files cannot be used: \S+f9.tif and 1 more: floating-point samples [^;]*; [^;]*$"
+    not_opened(found, tmp_path / "f9*.tif")
     not_opened("2 of 2 input files cannot be used", tmp_path / "f1[01].tif", on_bad_file="skip")
 
 

@@ -119,6 +119,10 @@ def test_criteria_stand_with_their_numbers_and_limits() -> None:
     assert set(found) == set(Criteria.model_fields) - {"medians"}
     assert (found["flagged_pixels"].found, found["flagged_pixels"].limit) == ("20 %", "≤ 10 %")
     assert not found["flagged_pixels"].met
+    data = flagged(0.2)
+    data.status[0] = FitStatus.EXCLUDED  # of the others the share stays
+    share = int(data.flagged.sum()) / (data.status.size - data.status.shape[1])
+    assert criteria(data)[2].found == f"{100 * share:.2g} %"
     assert found["read_noise_e"].met
     assert found["gain_nonuniformity"].found == "2 %"  # what the gains were drawn with
     # hot pixels are counted though they are flagged
