@@ -22,13 +22,9 @@ _SECRETS = re.compile(
 
 
 class Section(BaseModel):
-    """A frozen YAML section: unknown keys, NaN and infinities are refused.
+    """A frozen YAML section: unknown keys, NaN and infinities are refused."""
 
-    Attributes:
-        removed: keys of earlier versions, which are read and do nothing.
-    """
-
-    removed: ClassVar[tuple[str, ...]] = ()
+    removed: ClassVar[tuple[str, ...]] = ()  # keys of earlier versions, which are read and do nothing
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 

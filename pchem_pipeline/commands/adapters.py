@@ -38,23 +38,15 @@ class Calibration:
     """A camera as its frames without light show it.
 
     Maps have shape (y, x), and the median where a pixel has no fit.
-
-    Attributes:
-        integration_time: s; None: not known.
-        bits: of the codes of its ADC.
-        bias: DN.
-        gain: conversion gain, e-/DN.
-        read_noise: e-.
-        electrons: mean of the dark electrons of a frame, e-; 0 in a run of frames with light.
     """
 
     camera: CameraFacts
-    integration_time: float | None
-    bits: int
-    bias: FloatArray
-    gain: FloatArray
-    read_noise: FloatArray
-    electrons: FloatArray
+    integration_time: float | None  # s; None: not known
+    bits: int  # of the codes of its ADC
+    bias: FloatArray  # DN
+    gain: FloatArray  # conversion gain, e-/DN
+    read_noise: FloatArray  # e-
+    electrons: FloatArray  # mean of the dark electrons of a frame, e-; 0 in a run of frames with light
     fitted: BoolArray
     defects: BoolArray
 

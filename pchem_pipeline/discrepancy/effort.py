@@ -32,27 +32,16 @@ class EffortSpentError(Exception):
 
 @dataclass
 class Effort:
-    """Work of a search, CPU seconds by count.
+    """Work of a search, CPU seconds by count."""
 
-    Attributes:
-        share: factor on the default budget; None: no limit.
-        spent: so far.
-        most: nothing more is begun beyond it; infinite until the null distribution is drawn.
-        kept: for what no effect explains.
-        for_choice: for the choice among the sets that were tried.
-        for_fits: the least that is left for fits of candidates once they are compared.
-        tried: tags of all effects with which the pixels were fitted.
-        replicates: parts of simulated stacks, or sets of histograms, drawn so far.
-    """
-
-    share: float | None
-    spent: float = 0.0
-    most: float = math.inf
-    kept: float = 0.0
-    for_choice: float = 0.0
-    for_fits: float = 0.0
-    tried: set[str] = field(default_factory=set)
-    replicates: int = 0
+    share: float | None  # factor on the default budget; None: no limit
+    spent: float = 0.0  # so far
+    most: float = math.inf  # nothing more is begun beyond it; infinite until the null distribution is drawn
+    kept: float = 0.0  # for what no effect explains
+    for_choice: float = 0.0  # for the choice among the sets that were tried
+    for_fits: float = 0.0  # the least that is left for fits of candidates once they are compared
+    tried: set[str] = field(default_factory=set)  # tags of all effects with which the pixels were fitted
+    replicates: int = 0  # parts of simulated stacks, or sets of histograms, drawn so far
 
     def begin(self) -> None:
         """Set the limit, now that the null distribution has been paid; no candidate was fitted for that."""

@@ -191,23 +191,14 @@ def bounds(exposures: tuple[float, ...], noise: float, gain: float, frames: tupl
 
 @dataclass(frozen=True)
 class StudyPoint:
-    """Where and with what to simulate.
+    """Where and with what to simulate."""
 
-    Attributes:
-        read_noise_e: s_e, e-, quantisation included.
-        quanta_exposure: H of the bright sample, e-.
-        conversion_gain: g, e-/DN.
-        n_frames: frames of a pixel, all samples together.
-        n_pixels: pixels to simulate.
-        seed: of the random numbers.
-    """
-
-    read_noise_e: float
-    quanta_exposure: float
-    conversion_gain: float
-    n_frames: int
-    n_pixels: int
-    seed: int
+    read_noise_e: float  # s_e, e-, quantisation included
+    quanta_exposure: float  # H of the bright sample, e-
+    conversion_gain: float  # g, e-/DN
+    n_frames: int  # frames of a pixel, all samples together
+    n_pixels: int  # pixels to simulate
+    seed: int  # of the random numbers
 
 
 def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:

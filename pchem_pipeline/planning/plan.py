@@ -44,23 +44,14 @@ class Plan:
 
 @dataclass(frozen=True)
 class SamplesPlan:
-    """Several samples.
+    """Several samples."""
 
-    Attributes:
-        point: read noise and gain.
-        split: exposures, shares and frames in total by the bound.
-        even: frames in total with the same exposures and even shares.
-        needed: frames in total with which simulated pixels reach the targets, few of them flagged.
-        frames: these, or those of the budget.
-        per_sample: frames of each sample.
-    """
-
-    point: Point
-    split: Split
-    even: float
-    needed: float
-    frames: float
-    per_sample: tuple[int, ...]
+    point: Point  # read noise and gain
+    split: Split  # exposures, shares and frames in total by the bound
+    even: float  # frames in total with the same exposures and even shares
+    needed: float  # frames in total with which simulated pixels reach the targets, few of them flagged
+    frames: float  # these, or those of the budget
+    per_sample: tuple[int, ...]  # frames of each sample
 
 
 def plan_one_sample(

@@ -23,17 +23,11 @@ _LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Split:
-    """Samples and the share of the frames that each shall have.
+    """Samples and the share of the frames that each shall have."""
 
-    Attributes:
-        exposures: H of each sample, e-; 0 for bias frames.
-        shares: of the frames, adding up to 1.
-        frames: frames in total with which all targets are reached; infinite where they are not.
-    """
-
-    exposures: tuple[float, ...]
-    shares: tuple[float, ...]
-    frames: float
+    exposures: tuple[float, ...]  # H of each sample, e-; 0 for bias frames
+    shares: tuple[float, ...]  # of the frames, adding up to 1
+    frames: float  # frames in total with which all targets are reached; infinite where they are not
 
 
 def best_split(targets: Sequence[Target], exposures: Sequence[float], point: Point) -> Split:

@@ -27,19 +27,13 @@ _STEP = 1.1  # of the frames, within which their number is found
 
 @dataclass(frozen=True)
 class Check:
-    """One target after the simulation; numbers are relative, of the bias in e-.
-
-    Attributes:
-        wanted: standard deviation wanted.
-        rmse: root mean square error of the pixels that are not flagged.
-        robust_sd: 1.4826 times the median absolute error; a few pixels far off do not move it.
-    """
+    """One target after the simulation; numbers are relative, of the bias in e-."""
 
     target: Target
-    wanted: float
-    rmse: float
+    wanted: float  # standard deviation wanted
+    rmse: float  # root mean square error of the pixels that are not flagged
     rmse_stderr: float
-    robust_sd: float
+    robust_sd: float  # 1.4826 times the median absolute error; a few pixels far off do not move it
 
     @property
     def reached(self) -> bool:

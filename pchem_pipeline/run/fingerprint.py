@@ -24,22 +24,14 @@ _NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepanc
 
 @dataclass(frozen=True)
 class StageState:
-    """How far a stage is.
-
-    Attributes:
-        state: missing, partial, stale, complete or failed.
-        why: reason, for people.
-        done: finished units.
-        total: units of the complete stage (0 where not known yet).
-        model: number of the version of the model that its result rests on; None: of none.
-    """
+    """How far a stage is."""
 
     stage: str
-    state: str
-    why: str = ""
-    done: int = 0
-    total: int = 0
-    model: int | None = None
+    state: str  # missing, partial, stale, complete or failed
+    why: str = ""  # reason, for people
+    done: int = 0  # finished units
+    total: int = 0  # units of the complete stage (0 where not known yet)
+    model: int | None = None  # number of the version of the model that its result rests on; None: of none
 
     def words(self) -> str:
         """Return the state as ``pchem status`` prints it."""

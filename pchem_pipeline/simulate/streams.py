@@ -66,21 +66,13 @@ def poisson_quantile(u: FloatArray, mean: FloatArray) -> IntArray:
 
 @dataclass(frozen=True)
 class KeyedStreams:
-    """The random numbers of one purpose for a block of frames and a band of rows: a ``RandomSource``.
+    """The random numbers of one purpose for a block of frames and a band of rows: a ``RandomSource``."""
 
-    Attributes:
-        seed: root seed of the run.
-        purpose: what the numbers are for; other purposes get independent numbers.
-        frames: frame numbers of the block.
-        rows: sensor rows of the band.
-        columns: sensor columns, all of them.
-    """
-
-    seed: int
-    purpose: str
-    frames: IntArray
-    rows: IntArray
-    columns: IntArray
+    seed: int  # root seed of the run
+    purpose: str  # what the numbers are for; other purposes get independent numbers
+    frames: IntArray  # frame numbers of the block
+    rows: IntArray  # sensor rows of the band
+    columns: IntArray  # sensor columns, all of them
 
     def uniform(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:
         """Return uniform numbers in (0, 1), with length 1 along the dimensions not in ``dims``."""

@@ -46,24 +46,15 @@ class ObservedHistograms:
     """The histograms of a search, split and observed.
 
     Arrays have a row for each sample of each pixel, those of a pixel one after the other.
-
-    Attributes:
-        parts: train, test and final samples of the chosen rows, shape (r, B) each.
-        origin: DN of bin 0, shape (r,).
-        start: H, g, mu, sigma of the plain fit of the train part, shape (r, 4).
-        chosen: which rows of all they are, shape (r,).
-        layout: of the samples of a pixel.
-        n_pixels: of all.
-        evidence: of the train part of all rows with electrons.
     """
 
-    parts: tuple[IntArray, ...]
-    origin: IntArray
-    start: FloatArray
-    chosen: NDArray[np.intp]
-    layout: Samples
-    n_pixels: int
-    evidence: Evidence
+    parts: tuple[IntArray, ...]  # train, test and final samples of the chosen rows, shape (r, B) each
+    origin: IntArray  # DN of bin 0, shape (r,)
+    start: FloatArray  # H, g, mu, sigma of the plain fit of the train part, shape (r, 4)
+    chosen: NDArray[np.intp]  # which rows of all they are, shape (r,)
+    layout: Samples  # of the samples of a pixel
+    n_pixels: int  # of all
+    evidence: Evidence  # of the train part of all rows with electrons
 
     @classmethod
     def of(cls, samples: Sequence[SampleHistograms], rng: np.random.Generator) -> ObservedHistograms:

@@ -114,24 +114,16 @@ def find_discrepancies(
 
 @dataclass
 class FrameExplainer(Explainer[Screened]):
-    """Distinguishes effects in frames.
+    """Distinguishes effects in frames."""
 
-    Attributes:
-        prepared: the frames, split, and replicates of the model.
-        work: fits and simulates the frames.
-        given: effects that the model had before the search.
-        extension: the effects that it adds; None: none yet.
-        progress: is given what is done next.
-    """
-
-    prepared: Prepared
+    prepared: Prepared  # the frames, split, and replicates of the model
     observed: ObservedFrames
-    work: Simulations
+    work: Simulations  # fits and simulates the frames
     screening: Screening
     accept: Acceptance
-    given: tuple[Effect, ...]
-    extension: Extension | None = None
-    progress: Callable[[str], None] = no_progress
+    given: tuple[Effect, ...]  # effects that the model had before the search
+    extension: Extension | None = None  # the effects that it adds; None: none yet
+    progress: Callable[[str], None] = no_progress  # is given what is done next
     _likelihoods: dict[tuple[int, tuple[Effect, ...], tuple[Effect, ...]], PixelLikelihood] = field(
         default_factory=dict, repr=False
     )

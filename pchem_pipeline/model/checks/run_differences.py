@@ -35,19 +35,12 @@ _FEW = 0.01
 
 @dataclass(frozen=True)
 class BlockDifference:
-    """What differs between two blocks of values.
+    """What differs between two blocks of values."""
 
-    Attributes:
-        n_values: values compared.
-        n_different: values that are not equal; NaN equals NaN.
-        n_beyond: values that differ by more than rounding, NaN against a number included.
-        largest: largest absolute difference of two numbers, in their unit.
-    """
-
-    n_values: int
-    n_different: int
-    n_beyond: int
-    largest: float
+    n_values: int  # values compared
+    n_different: int  # values that are not equal; NaN equals NaN
+    n_beyond: int  # values that differ by more than rounding, NaN against a number included
+    largest: float  # largest absolute difference of two numbers, in their unit
 
     def __add__(self, other: BlockDifference) -> BlockDifference:
         """Return both blocks together."""
@@ -242,17 +235,11 @@ def _difference(
 
 @dataclass(frozen=True)
 class Reasons:
-    """Why two measurements of a map differ by more than chance; all False where they do not.
+    """Why two measurements of a map differ by more than chance; all False where they do not."""
 
-    Attributes:
-        shifted: the median is beyond the limit.
-        spread: ``z`` scatters more than its standard errors allow.
-        pixels: single pixels changed.
-    """
-
-    shifted: bool
-    spread: bool
-    pixels: bool
+    shifted: bool  # the median is beyond the limit
+    spread: bool  # ``z`` scatters more than its standard errors allow
+    pixels: bool  # single pixels changed
 
     def __bool__(self) -> bool:
         """Return whether there is any."""

@@ -54,17 +54,11 @@ class _Prior:
 
 
 class Judged(NamedTuple):
-    """What the judgement looks at, of n pixels, NaN where there is no value.
+    """What the judgement looks at, of n pixels, NaN where there is no value."""
 
-    Attributes:
-        noise: s_e, e-, shape (n,).
-        stderr: its standard error, e-, shape (n,).
-        gap: likelihood gap, nats, shape (n,).
-    """
-
-    noise: FloatArray
-    stderr: FloatArray
-    gap: FloatArray
+    noise: FloatArray  # s_e, e-, shape (n,)
+    stderr: FloatArray  # its standard error, e-, shape (n,)
+    gap: FloatArray  # likelihood gap, nats, shape (n,)
 
     @classmethod
     def join(cls, parts: Sequence[Judged]) -> Judged:
@@ -92,17 +86,11 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True)
 class NoisePool:
-    """What the pixels of a sensor have in common.
+    """What the pixels of a sensor have in common."""
 
-    Attributes:
-        noise: where their read noises lie, e-.
-        looseness: where the logarithms of their looseness lie.
-        gap_slope: change of the logarithm of the likelihood gap with the read noise, 1/e-, not positive.
-    """
-
-    noise: _Prior
-    looseness: _Prior
-    gap_slope: float
+    noise: _Prior  # where their read noises lie, e-
+    looseness: _Prior  # where the logarithms of their looseness lie
+    gap_slope: float  # change of the logarithm of the likelihood gap with the read noise, 1/e-, not positive
 
     @classmethod
     def of(cls, pixels: Judged) -> NoisePool | None:

@@ -28,37 +28,22 @@ NO_PRIOR = -1.0
 
 
 class PixelLaws(NamedTuple):
-    """What n pixels and their samples follow.
+    """What n pixels and their samples follow."""
 
-    Attributes:
-        parameters: (H, g, mu, sigma), shape (n, 4).
-        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
-        law: of the samples.
-    """
-
-    parameters: FloatArray
-    satellites: FloatArray
-    law: Law
+    parameters: FloatArray  # (H, g, mu, sigma), shape (n, 4)
+    satellites: FloatArray  # amplitude (e-) and weight of free satellites, shape (n, 2)
+    law: Law  # of the samples
 
 
 class CodeTables(NamedTuple):
-    """What each code of n pixels says of the electron number, one pixel after the other.
+    """What each code of n pixels says of the electron number, one pixel after the other."""
 
-    Attributes:
-        first: first code of each pixel, shape (n,).
-        start: place of it in the tables; the last element is their length, shape (n + 1,).
-        number: the most probable one; the largest value of the type: none.
-        mass: P(code); empty: not wanted.
-        right: P(code, and the number is right); likewise.
-        expected: E[k | x], e-; likewise, and NaN where the law expects no such code.
-    """
-
-    first: IntArray
-    start: IntArray
-    number: NDArray[Any]
-    mass: FloatArray
-    right: FloatArray
-    expected: Float32Array
+    first: IntArray  # first code of each pixel, shape (n,)
+    start: IntArray  # place of it in the tables; the last element is their length, shape (n + 1,)
+    number: NDArray[Any]  # the most probable one; the largest value of the type: none
+    mass: FloatArray  # P(code); empty: not wanted
+    right: FloatArray  # P(code, and the number is right); likewise
+    expected: Float32Array  # E[k | x], e-; likewise, and NaN where the law expects no such code
 
 
 class Numbers(NamedTuple):

@@ -61,15 +61,10 @@ MODEL_ERRORS = ("pcd_error", "nuced_error")
 
 @dataclass(frozen=True)
 class DnAxis:
-    """Consecutive integer DN.
+    """Consecutive integer DN."""
 
-    Attributes:
-        start: first DN.
-        size: number of DN.
-    """
-
-    start: int
-    size: int
+    start: int  # first DN
+    size: int  # number of DN
 
     @property
     def dn(self) -> IntArray:
@@ -79,17 +74,11 @@ class DnAxis:
 
 @dataclass(frozen=True)
 class NucedAxis:
-    """Equal bins of the NUCed value ``(x - mu) g``; bin j is centred on ``(start + j) width``.
+    """Equal bins of the NUCed value ``(x - mu) g``; bin j is centred on ``(start + j) width``."""
 
-    Attributes:
-        width: bin width, e-.
-        start: index of the first bin; bin 0 is centred on 0 e-.
-        size: number of bins.
-    """
-
-    width: float
-    start: int
-    size: int
+    width: float  # bin width, e-
+    start: int  # index of the first bin; bin 0 is centred on 0 e-
+    size: int  # number of bins
 
     @property
     def electrons(self) -> FloatArray:
@@ -99,17 +88,11 @@ class NucedAxis:
 
 @dataclass(frozen=True)
 class EnsembleAxes:
-    """The axes of the ensemble, and where each sum stands in the rows of a tile.
+    """The axes of the ensemble, and where each sum stands in the rows of a tile."""
 
-    Attributes:
-        dn: DN of the raw ensemble.
-        nuced: bins of the NUCed ensemble.
-        n_k: number of electron numbers.
-    """
-
-    dn: DnAxis
-    nuced: NucedAxis
-    n_k: int
+    dn: DnAxis  # DN of the raw ensemble
+    nuced: NucedAxis  # bins of the NUCed ensemble
+    n_k: int  # number of electron numbers
 
     @cached_property
     def integers(self) -> dict[str, slice]:
@@ -168,23 +151,14 @@ class EnsembleTotals:
 
 @dataclass(frozen=True)
 class AxisSums:
-    """Sums over pixels on the two axes, of predicted masses or of samples.
+    """Sums over pixels on the two axes, of predicted masses or of samples."""
 
-    Attributes:
-        raw: of what lies at each whole DN, shape (n_dn,).
-        raw_square: of its square.
-        nuced: of what lies in each bin of the NUCed axis, shape (n_bins,).
-        nuced_square: of its square.
-        nuced_sum: of the NUCed values, e-.
-        nuced_sum_square: of their squares, e-^2.
-    """
-
-    raw: FloatArray
-    raw_square: FloatArray
-    nuced: FloatArray
-    nuced_square: FloatArray
-    nuced_sum: float
-    nuced_sum_square: float
+    raw: FloatArray  # of what lies at each whole DN, shape (n_dn,)
+    raw_square: FloatArray  # of its square
+    nuced: FloatArray  # of what lies in each bin of the NUCed axis, shape (n_bins,)
+    nuced_square: FloatArray  # of its square
+    nuced_sum: float  # of the NUCed values, e-
+    nuced_sum_square: float  # of their squares, e-^2
 
 
 def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None) -> NucedAxis:
@@ -260,18 +234,12 @@ class PixelErrors:
     A standard error need not be known to better than a per cent of itself, so of a large sensor some pixels
     are enough: each is taken with a known probability and counts for its inverse (Horvitz and Thompson 1952),
     the more probably the larger its errors are, so that the few that fit badly do not decide by chance.
-
-    Attributes:
-        stderr: of (H, g, mu, sigma), shape (n, 4); NaN where not known.
-        correlation: of the estimates, shape (n, 6).
-        place: number of each pixel on the sensor, shape (n,): which ones are taken depends on no tile.
-        share: of ordinary pixels that is taken.
     """
 
-    stderr: FloatArray
-    correlation: FloatArray
-    place: IntArray
-    share: float = 1.0
+    stderr: FloatArray  # of (H, g, mu, sigma), shape (n, 4); NaN where not known
+    correlation: FloatArray  # of the estimates, shape (n, 6)
+    place: IntArray  # number of each pixel on the sensor, shape (n,): which ones are taken depends on no tile
+    share: float = 1.0  # of ordinary pixels that is taken
 
     def of(self, pixels: BoolArray | IntArray) -> PixelErrors:
         """Return those of some pixels."""

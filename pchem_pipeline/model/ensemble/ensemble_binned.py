@@ -39,15 +39,10 @@ _ALIKE = 4.0
 
 @dataclass(frozen=True)
 class Cells:
-    """Occupied cells of a histogram of d parameters.
+    """Occupied cells of a histogram of d parameters."""
 
-    Attributes:
-        share: part of the pixels in each cell, shape (n_cells,), adding up to 1.
-        values: parameters that stand for each cell, shape (d, n_cells).
-    """
-
-    share: FloatArray
-    values: FloatArray
+    share: FloatArray  # part of the pixels in each cell, shape (n_cells,), adding up to 1
+    values: FloatArray  # parameters that stand for each cell, shape (d, n_cells)
 
 
 def joint_cells(columns: Sequence[FloatArray], bins: int) -> Cells:

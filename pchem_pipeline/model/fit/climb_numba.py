@@ -75,43 +75,24 @@ _BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains 
 
 
 class Limits(NamedTuple):
-    """Bounds and limits of a climb and of the search, see :mod:`pchem_pipeline.model.fit.settings`.
+    """Bounds and limits of a climb and of the search, see :mod:`pchem_pipeline.model.fit.settings`."""
 
-    Attributes:
-        bound: smallest log H.
-        tolerance: rise of the log-likelihood below which a climb ends, nats.
-        most: evaluations allowed in a climb.
-        warm_up: EM steps before the first Newton step, from a start.
-        only_em: take nothing but EM steps from a start.
-        cells: integrate the cells; else take the density.
-        gap: nats below which a bias is ambiguous and a gain not identified.
-        noise: e-, above which one sample does not inform.
-        floor: expected frames per DN of the tail guard; 0: none.
-        most_outliers: largest share of the frames that it leaves out.
-        satellite_rise: nats that free satellites must bring.
-        reshapes: the law changes more than the width of peaks: look at neighbours.
-        warm: a start is of nearly the same law, not of the density.
-        scan: look for other starts at few DN per electron.
-        quick: with the density, the first maximum that tells the gain will do.
-        sandwich: the covariance is to hold even where the model does not.
-    """
-
-    bound: float
-    tolerance: float
-    most: int
-    warm_up: int
-    only_em: bool
-    cells: bool
-    gap: float
-    noise: float
-    floor: float
-    most_outliers: float
-    satellite_rise: float
-    reshapes: bool
-    warm: bool
-    scan: bool
-    quick: bool
-    sandwich: bool
+    bound: float  # smallest log H
+    tolerance: float  # rise of the log-likelihood below which a climb ends, nats
+    most: int  # evaluations allowed in a climb
+    warm_up: int  # EM steps before the first Newton step, from a start
+    only_em: bool  # take nothing but EM steps from a start
+    cells: bool  # integrate the cells; else take the density
+    gap: float  # nats below which a bias is ambiguous and a gain not identified
+    noise: float  # e-, above which one sample does not inform
+    floor: float  # expected frames per DN of the tail guard; 0: none
+    most_outliers: float  # largest share of the frames that it leaves out
+    satellite_rise: float  # nats that free satellites must bring
+    reshapes: bool  # the law changes more than the width of peaks: look at neighbours
+    warm: bool  # a start is of nearly the same law, not of the density
+    scan: bool  # look for other starts at few DN per electron
+    quick: bool  # with the density, the first maximum that tells the gain will do
+    sandwich: bool  # the covariance is to hold even where the model does not
 
 
 class Goal(NamedTuple):

@@ -95,37 +95,22 @@ class Tools(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What is asked of a search, and what is known before.
+    """What is asked of a search, and what is known before."""
 
-    Attributes:
-        law: of all pixels.
-        row: of the pixel in it.
-        amplitudes: of free satellites to try, e-.
-        near: theta near the maximum, v with the rounding; its step is 0 where nothing is known.
-        gap: nats of that answer above its runner-up.
-    """
-
-    law: Law
-    row: int
-    amplitudes: FloatArray
-    near: FloatArray
-    gap: float
+    law: Law  # of all pixels
+    row: int  # of the pixel in it
+    amplitudes: FloatArray  # of free satellites to try, e-
+    near: FloatArray  # theta near the maximum, v with the rounding; its step is 0 where nothing is known
+    gap: float  # nats of that answer above its runner-up
 
 
 class Found(NamedTuple):
-    """How far a search has come.
+    """How far a search has come."""
 
-    Attributes:
-        loglik: log-likelihood of the best maximum, -inf without one.
-        runner_up: that of the next one.
-        used: evaluations.
-        degenerate: a climb ran towards one Gaussian.
-    """
-
-    loglik: float
-    runner_up: float
-    used: int
-    degenerate: bool | np.bool_
+    loglik: float  # log-likelihood of the best maximum, -inf without one
+    runner_up: float  # that of the next one
+    used: int  # evaluations
+    degenerate: bool | np.bool_  # a climb ran towards one Gaussian
 
 
 @kernel(borrows=True)

@@ -119,25 +119,15 @@ class Samples:
 
 @dataclass(frozen=True)
 class SharedProblem:
-    """Histograms and the law that they are to follow.
+    """Histograms and the law that they are to follow."""
 
-    Attributes:
-        counts: histograms, shape (n, B); n counts the samples of all pixels.
-        origin: DN of bin 0, shape (n,).
-        kept: codes that count, shape (n, B).
-        law: from shared and own parameters to the law of the rows.
-        bounds: lowest and highest value of each shared parameter, shape (d, 2).
-        scale: natural scale of each shared parameter, shape (d,).
-        samples: which rows are of one pixel.
-    """
-
-    counts: IntegerArray
-    origin: IntArray
-    kept: BoolArray
-    law: Law
-    bounds: FloatArray
-    scale: FloatArray
-    samples: Samples = field(default_factory=Samples)
+    counts: IntegerArray  # histograms, shape (n, B); n counts the samples of all pixels
+    origin: IntArray  # DN of bin 0, shape (n,)
+    kept: BoolArray  # codes that count, shape (n, B)
+    law: Law  # from shared and own parameters to the law of the rows
+    bounds: FloatArray  # lowest and highest value of each shared parameter, shape (d, 2)
+    scale: FloatArray  # natural scale of each shared parameter, shape (d,)
+    samples: Samples = field(default_factory=Samples)  # which rows are of one pixel
 
     def masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the mass of every code, those left out included, shape (n, B)."""
@@ -263,17 +253,11 @@ def fit_shared(
 
 @dataclass
 class Expansion:
-    """A function of own parameters (n, P) and shared ones (d,) about a point, to second order.
+    """A function of own parameters (n, P) and shared ones (d,) about a point, to second order."""
 
-    Attributes:
-        value: of each pixel, shape (n,).
-        score: its gradient, own parameters first, shape (n, P + d).
-        information: the curvature with the opposite sign, as expected, shape (n, P + d, P + d).
-    """
-
-    value: FloatArray
-    score: FloatArray
-    information: FloatArray
+    value: FloatArray  # of each pixel, shape (n,)
+    score: FloatArray  # its gradient, own parameters first, shape (n, P + d)
+    information: FloatArray  # the curvature with the opposite sign, as expected, shape (n, P + d, P + d)
 
     def of(self, pixels: Any) -> Expansion:
         """Return that of some pixels, by any index."""

@@ -68,21 +68,13 @@ N_WORDS = 6
 
 
 class Histograms(NamedTuple):
-    """The histograms of n pixels at J exposures.
+    """The histograms of n pixels at J exposures."""
 
-    Attributes:
-        counts: of the samples of each pixel, one after the other, shape (n, all bins).
-        places: where each sample begins among the bins, and the end, shape (J + 1,).
-        origin: DN of the first bin of each sample, shape (n, J).
-        dark: which samples hold no electrons, shape (J,).
-        mask: codes that do not count, see `COUNTED`, shape (n, all bins).
-    """
-
-    counts: NDArray[np.integer]
-    places: IntArray
-    origin: IntArray
-    dark: BoolArray
-    mask: NDArray[np.uint8]
+    counts: NDArray[np.integer]  # of the samples of each pixel, one after the other, shape (n, all bins)
+    places: IntArray  # where each sample begins among the bins, and the end, shape (J + 1,)
+    origin: IntArray  # DN of the first bin of each sample, shape (n, J)
+    dark: BoolArray  # which samples hold no electrons, shape (J,)
+    mask: NDArray[np.uint8]  # codes that do not count, see `COUNTED`, shape (n, all bins)
 
 
 class Starts(NamedTuple):
@@ -103,21 +95,13 @@ class Starts(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """What the loop fills.
+    """What the loop fills."""
 
-    Attributes:
-        parameters: (H_1 ... H_J, g, mu, sigma), shape (n, J + 3); comes as NaN.
-        covariance: shape (n, J + 3, J + 3); comes as NaN.
-        moments: mean (DN) and variance (DN^2) of each sample, shape (n, J, 2); comes as NaN.
-        out: shape (n, N_OUT), see :mod:`.search_numba`; comes as NaN.
-        words: shape (n, N_WORDS); comes as 0.
-    """
-
-    parameters: FloatArray
-    covariance: FloatArray
-    moments: FloatArray
-    out: FloatArray
-    words: IntArray
+    parameters: FloatArray  # (H_1 ... H_J, g, mu, sigma), shape (n, J + 3); comes as NaN
+    covariance: FloatArray  # shape (n, J + 3, J + 3); comes as NaN
+    moments: FloatArray  # mean (DN) and variance (DN^2) of each sample, shape (n, J, 2); comes as NaN
+    out: FloatArray  # shape (n, N_OUT), see :mod:`.search_numba`; comes as NaN
+    words: IntArray  # shape (n, N_WORDS); comes as 0
 
 
 @kernel

@@ -48,23 +48,14 @@ def counts_dtype(n_frames: int) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class RowHistograms:
-    """Histograms of the pixels of some rows.
+    """Histograms of the pixels of some rows."""
 
-    Attributes:
-        counts: number of frames with DN = origin + bin, (y, x, bin).
-        origin: DN of bin 0, (y, x).
-        under: number of frames below bin 0, (y, x).
-        over: number of frames above the last bin, (y, x).
-        minimum: smallest DN seen, (y, x).
-        maximum: largest DN seen, (y, x).
-    """
-
-    counts: CodeArray
-    origin: NDArray[np.int32]
-    under: NDArray[np.uint32]
-    over: NDArray[np.uint32]
-    minimum: NDArray[np.int32]
-    maximum: NDArray[np.int32]
+    counts: CodeArray  # number of frames with DN = origin + bin, (y, x, bin)
+    origin: NDArray[np.int32]  # DN of bin 0, (y, x)
+    under: NDArray[np.uint32]  # number of frames below bin 0, (y, x)
+    over: NDArray[np.uint32]  # number of frames above the last bin, (y, x)
+    minimum: NDArray[np.int32]  # smallest DN seen, (y, x)
+    maximum: NDArray[np.int32]  # largest DN seen, (y, x)
 
 
 class HistogramAccumulator:

@@ -101,25 +101,15 @@ EDGES_KEPT = 8192
 
 
 class Histogram(NamedTuple):
-    """One sample's histogram without its empty ends, values counted from a centre near its mean.
+    """One sample's histogram without its empty ends, values counted from a centre near its mean."""
 
-    Attributes:
-        weights: counts of successive DN, at least ``n_bins`` long.
-        cumulative: ``cumulative[i]`` is the sum of the first i weights.
-        n_bins: number of DN in use.
-        first: first DN minus the centre.
-        n: number of frames.
-        mean: mean minus the centre, DN.
-        variance: variance, DN^2.
-    """
-
-    weights: FloatArray
-    cumulative: FloatArray
-    n_bins: int
-    first: float
-    n: float
-    mean: float
-    variance: float
+    weights: FloatArray  # counts of successive DN, at least ``n_bins`` long
+    cumulative: FloatArray  # ``cumulative[i]`` is the sum of the first i weights
+    n_bins: int  # number of DN in use
+    first: float  # first DN minus the centre
+    n: float  # number of frames
+    mean: float  # mean minus the centre, DN
+    variance: float  # variance, DN^2
 
 
 class Pixel(NamedTuple):

@@ -17,17 +17,11 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, Intege
 
 @dataclass(frozen=True)
 class ReplacedSamples:
-    """What becomes of the samples of n pixels, by their code.
+    """What becomes of the samples of n pixels, by their code."""
 
-    Attributes:
-        stays: chance that a sample comes out as it is, at successive codes, shape (n, c).
-        comes: chance that y is that code, times s, shape (n, c).
-        excess: t, DN, or c where that is less, shape (n,).
-    """
-
-    stays: FloatArray
-    comes: FloatArray
-    excess: IntegerArray
+    stays: FloatArray  # chance that a sample comes out as it is, at successive codes, shape (n, c)
+    comes: FloatArray  # chance that y is that code, times s, shape (n, c)
+    excess: IntegerArray  # t, DN, or c where that is less, shape (n,)
 
     @classmethod
     def by(

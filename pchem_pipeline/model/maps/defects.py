@@ -48,21 +48,13 @@ _SATURATED = 0.5
 
 
 class Moments(NamedTuple):
-    """What the histograms of n pixels say without a fit.
+    """What the histograms of n pixels say without a fit."""
 
-    Attributes:
-        pixel: ``y * nx + x`` of each, shape (n,).
-        n_frames: samples of each, shape (n,).
-        mean: DN, shape (n,).
-        variance: DN^2, shape (n,).
-        top_share: share of the samples at the highest code of the ADC, shape (n,).
-    """
-
-    pixel: IntArray
-    n_frames: IntArray
-    mean: FloatArray
-    variance: FloatArray
-    top_share: FloatArray
+    pixel: IntArray  # ``y * nx + x`` of each, shape (n,)
+    n_frames: IntArray  # samples of each, shape (n,)
+    mean: FloatArray  # DN, shape (n,)
+    variance: FloatArray  # DN^2, shape (n,)
+    top_share: FloatArray  # share of the samples at the highest code of the ADC, shape (n,)
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,11 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Ordered:
-    """Values of a map in increasing order.
+    """Values of a map in increasing order."""
 
-    Attributes:
-        values: the finite ones that count, shape (n,).
-        n_missing: pixels that are NaN or infinite.
-        n_left_out: pixels with a value that do not count.
-    """
-
-    values: FloatArray
-    n_missing: int = 0
-    n_left_out: int = 0
+    values: FloatArray  # the finite ones that count, shape (n,)
+    n_missing: int = 0  # pixels that are NaN or infinite
+    n_left_out: int = 0  # pixels with a value that do not count
 
     @classmethod
     def of(cls, values: NDArray[Any] | Ordered, left_out: BoolArray | None = None) -> Ordered:

@@ -30,17 +30,11 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 @dataclass(frozen=True)
 class PixelHistograms:
-    """Histograms of some pixels, along one axis or of rows and columns of the sensor.
+    """Histograms of some pixels, along one axis or of rows and columns of the sensor."""
 
-    Attributes:
-        counts: samples per bin, shape (..., n_bins).
-        origin: DN of bin 0, shape (...).
-        outside: samples outside of the bins, shape (...).
-    """
-
-    counts: NDArray[np.integer[Any]]
-    origin: NDArray[np.integer[Any]]
-    outside: NDArray[np.integer[Any]]
+    counts: NDArray[np.integer[Any]]  # samples per bin, shape (..., n_bins)
+    origin: NDArray[np.integer[Any]]  # DN of bin 0, shape (...)
+    outside: NDArray[np.integer[Any]]  # samples outside of the bins, shape (...)
 
     def of(self, chosen: BoolArray | tuple[slice, slice]) -> PixelHistograms:
         """Return those of the chosen pixels."""

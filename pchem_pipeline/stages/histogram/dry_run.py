@@ -24,19 +24,12 @@ _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
 
 
 class Plan(NamedTuple):
-    """What a run from camera files to the report takes.
+    """What a run from camera files to the report takes."""
 
-    Attributes:
-        bins: of a pixel.
-        single_pass: the camera files are read once; else twice, by bands of rows.
-        held_bytes: largest resident memory of the process.
-        lines: as ``--dry-run`` prints it.
-    """
-
-    bins: int
-    single_pass: bool
-    held_bytes: int
-    lines: list[str]
+    bins: int  # of a pixel
+    single_pass: bool  # the camera files are read once; else twice, by bands of rows
+    held_bytes: int  # largest resident memory of the process
+    lines: list[str]  # as ``--dry-run`` prints it
 
 
 def plan_lines(config: RunConfig, base_dir: Path, todo: Sequence[str]) -> list[str]:

@@ -80,24 +80,15 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
 
 @dataclass
 class ReplicateSimulator:
-    """Simulates what candidates would do on top of the present model.
+    """Simulates what candidates would do on top of the present model."""
 
-    Attributes:
-        maps: parameters of the pixels under the model.
-        acquisition: of the split that is simulated.
-        names: of the statistics.
-        mapper: runs the replicates.
-        seed: of the random numbers that all candidates share.
-        defects: candidates that failed, and why; out.
-    """
-
-    maps: PixelMaps
+    maps: PixelMaps  # parameters of the pixels under the model
     model: tuple[Effect, ...]
-    acquisition: Acquisition
-    names: tuple[str, ...]
-    mapper: Mapper
-    seed: int
-    defects: dict[str, str] = field(default_factory=dict)
+    acquisition: Acquisition  # of the split that is simulated
+    names: tuple[str, ...]  # of the statistics
+    mapper: Mapper  # runs the replicates
+    seed: int  # of the random numbers that all candidates share
+    defects: dict[str, str] = field(default_factory=dict)  # candidates that failed, and why; out
     _rows: dict[str, FloatArray] = field(default_factory=dict)
 
     def guesses(

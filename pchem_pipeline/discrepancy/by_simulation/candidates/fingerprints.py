@@ -38,17 +38,11 @@ _BLUR = 2.0  # model errors of the others that are added to chance there
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """An effect with parameters, and what it would do to the statistics.
+    """An effect with parameters, and what it would do to the statistics."""
 
-    Attributes:
-        effect: with guessed or refined parameters.
-        fingerprint: shift of the statistics at this strength, shape (m,).
-        number: 1 for the first effect of its tag, 2 for the second one, at another place, and so on.
-    """
-
-    effect: Effect
-    fingerprint: FloatArray
-    number: int = 1
+    effect: Effect  # with guessed or refined parameters
+    fingerprint: FloatArray  # shift of the statistics at this strength, shape (m,)
+    number: int = 1  # 1 for the first effect of its tag, 2 for the second one, at another place, and so on
 
     @property
     def tag(self) -> str:
@@ -105,18 +99,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class SetFit:
-    """A set of hypotheses fitted to the shift of one split, with arrays of shape (e,).
-
-    Attributes:
-        factors: c_e of each, at least 0.
-        stderr: their standard errors.
-        certain: whether an exact count asks for it, however few events it has.
-    """
+    """A set of hypotheses fitted to the shift of one split, with arrays of shape (e,)."""
 
     hypotheses: tuple[Hypothesis, ...]
-    factors: FloatArray
-    stderr: FloatArray
-    certain: BoolArray
+    factors: FloatArray  # c_e of each, at least 0
+    stderr: FloatArray  # their standard errors
+    certain: BoolArray  # whether an exact count asks for it, however few events it has
 
     @property
     def parts(self) -> FloatArray:

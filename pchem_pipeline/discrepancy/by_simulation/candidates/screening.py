@@ -48,23 +48,15 @@ class Screened:
 
 @dataclass(frozen=True)
 class Screening:
-    """Simulates the candidates.
-
-    Attributes:
-        z: statistics of the data.
-        classes: of the candidates, by tag.
-        given: effects that the model had before the search.
-        model_error: relative error of a fingerprint.
-        defects: candidates that failed, and why; out.
-    """
+    """Simulates the candidates."""
 
     observed: ObservedFrames
     work: Simulations
-    z: Measured
-    classes: Mapping[str, type[Effect]]
-    given: tuple[Effect, ...]
-    model_error: float
-    defects: dict[str, str] = field(default_factory=dict)
+    z: Measured  # statistics of the data
+    classes: Mapping[str, type[Effect]]  # of the candidates, by tag
+    given: tuple[Effect, ...]  # effects that the model had before the search
+    model_error: float  # relative error of a fingerprint
+    defects: dict[str, str] = field(default_factory=dict)  # candidates that failed, and why; out
 
     def of(self, model: tuple[Effect, ...], null: NullModel) -> Screened:
         """Return what they would do beside a model with this null: everywhere and in the parts, by split."""

@@ -21,27 +21,16 @@ _BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
 
 @dataclass(frozen=True)
 class FrameStack:
-    """The frames that are examined.
+    """The frames that are examined."""
 
-    Attributes:
-        stack: (frame, y, x), DN.
-        numbers: of the frames in the run, shape (frame,).
-        splits: train, test and final part.
-        n_run: frames of the whole run.
-        bit_depth: bits of the ADC.
-        integration_time: s.
-        parts: of sensor and run that differ from the rest.
-        window: of the sensor; None: all of it.
-    """
-
-    stack: NDArray[np.unsignedinteger]
-    numbers: IntArray
-    splits: Splits
-    n_run: int
-    bit_depth: int
-    integration_time: float
-    parts: tuple[Part, ...] = ()
-    window: SensorWindow | None = None
+    stack: NDArray[np.unsignedinteger]  # (frame, y, x), DN
+    numbers: IntArray  # of the frames in the run, shape (frame,)
+    splits: Splits  # train, test and final part
+    n_run: int  # frames of the whole run
+    bit_depth: int  # bits of the ADC
+    integration_time: float  # s
+    parts: tuple[Part, ...] = ()  # of sensor and run that differ from the rest
+    window: SensorWindow | None = None  # of the sensor; None: all of it
 
     @classmethod
     def of(

@@ -22,16 +22,11 @@ _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters a
 
 @dataclass(frozen=True)
 class ObservedFrames:
-    """The frames of a search, with the parts of sensor and run that differ, observed.
-
-    Attributes:
-        plain: evidence of train and test frames together, fitted without effects.
-        parts: evidence of train, test and final frames, each near that fit.
-    """
+    """The frames of a search, with the parts of sensor and run that differ, observed."""
 
     frames: FrameStack
-    plain: Evidence
-    parts: tuple[Evidence, Evidence, Evidence]
+    plain: Evidence  # evidence of train and test frames together, fitted without effects
+    parts: tuple[Evidence, Evidence, Evidence]  # evidence of train, test and final frames, each near that fit
 
     @classmethod
     def of(cls, frames: FrameStack) -> ObservedFrames:

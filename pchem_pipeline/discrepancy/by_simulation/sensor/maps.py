@@ -269,19 +269,12 @@ def changes(before: FloatArray, after: FloatArray, stderr: FloatArray) -> dict[s
 
 @dataclass(frozen=True)
 class Sensor:
-    """The distribution of the true parameters of the pixels: sensors to simulate whose fits come out alike.
+    """The distribution of the true parameters of the pixels: simulated sensors whose fits come out alike."""
 
-    Attributes:
-        posterior: of the pixels that can be simulated.
-        drawn: which those are, shape (y, x).
-        usable: pixels whose fit can be relied upon, shape (y, x).
-        lost: bias of log sigma_R^2, which is corrected.
-    """
-
-    posterior: Posterior
-    drawn: BoolArray
-    usable: BoolArray
-    lost: float = 0.0
+    posterior: Posterior  # of the pixels that can be simulated
+    drawn: BoolArray  # which those are, shape (y, x)
+    usable: BoolArray  # pixels whose fit can be relied upon, shape (y, x)
+    lost: float = 0.0  # bias of log sigma_R^2, which is corrected
 
     def draw(self, seed: int) -> PixelMaps:
         """Return maps that may be the true ones; ``usable`` are those that can be simulated."""

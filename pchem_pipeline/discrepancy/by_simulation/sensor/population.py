@@ -76,18 +76,12 @@ class Population:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Where the true theta of n pixels may lie: a mixture of Gaussians about j maxima each.
-
-    Attributes:
-        theta: maxima, shape (j, n, 4).
-        covariance: shape (j, n, 4, 4).
-        weight: of the maxima, sums to 1 over j, shape (j, n).
-    """
+    """Where the true theta of n pixels may lie: a mixture of Gaussians about j maxima each."""
 
     population: Population
-    theta: FloatArray
-    covariance: FloatArray
-    weight: FloatArray
+    theta: FloatArray  # maxima, shape (j, n, 4)
+    covariance: FloatArray  # shape (j, n, 4, 4)
+    weight: FloatArray  # of the maxima, sums to 1 over j, shape (j, n)
 
     def likeliest(self) -> FloatArray:
         """Return (H, g, mu, sigma) at the maximum of most weight, shape (n, 4)."""

@@ -83,19 +83,12 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Replicate:
-    """A stack to simulate from maps and effects, and to observe.
+    """A stack to simulate from maps and effects, and to observe."""
 
-    Attributes:
-        key: unique in a run of the workflow.
-        maps: parameters of the pixels.
-        effects: of the model, in their order.
-        seed: root of its random numbers; equal seeds share them whatever the effects.
-    """
-
-    key: str
-    maps: PixelMaps
-    effects: tuple[Effect, ...]
-    seed: int
+    key: str  # unique in a run of the workflow
+    maps: PixelMaps  # parameters of the pixels
+    effects: tuple[Effect, ...]  # of the model, in their order
+    seed: int  # root of its random numbers; equal seeds share them whatever the effects
     acquisition: Acquisition
 
     @property

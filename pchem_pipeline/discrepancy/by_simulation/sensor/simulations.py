@@ -45,22 +45,14 @@ class Mapped:
 
 @dataclass
 class Simulations:
-    """Fits of the seen frames, and stacks simulated from them.
-
-    Attributes:
-        mapper: runs the simulated stacks.
-        seed: root of all random numbers.
-        effort: counts the work.
-        given: effects that the model had before the search.
-        known: cache of `mapped`.
-    """
+    """Fits of the seen frames, and stacks simulated from them."""
 
     observed: ObservedFrames
-    mapper: Mapper
-    seed: int
-    effort: Effort
-    given: tuple[Effect, ...] = ()
-    known: dict[tuple[Effect, ...], Mapped] = field(default_factory=dict)
+    mapper: Mapper  # runs the simulated stacks
+    seed: int  # root of all random numbers
+    effort: Effort  # counts the work
+    given: tuple[Effect, ...] = ()  # effects that the model had before the search
+    known: dict[tuple[Effect, ...], Mapped] = field(default_factory=dict)  # cache of `mapped`
 
     @property
     def frames(self) -> FrameStack:

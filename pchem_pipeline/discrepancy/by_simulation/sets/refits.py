@@ -154,21 +154,13 @@ def broyden(slopes: FloatArray, step: FloatArray, unforeseen: FloatArray) -> Flo
 
 @dataclass
 class Steps(DampedSteps[Refitted]):
-    """The search for the strengths of a set that explain the data best; it may go through a dip of the score.
+    """The search for the strengths of a set that explain the data best; the score may dip on the way."""
 
-    Attributes:
-        now: the set at its last strengths.
-        step: that led there, logarithms of factors, shape (e,).
-        gained: nats, by the last improvement.
-        further: steps since the last improvement.
-        taken_so_far: steps in all.
-    """
-
-    now: Refitted = field(kw_only=True)
-    step: FloatArray = field(kw_only=True)
-    gained: float = np.inf
-    further: int = 0
-    taken_so_far: int = 0
+    now: Refitted = field(kw_only=True)  # the set at its last strengths
+    step: FloatArray = field(kw_only=True)  # that led there, logarithms of factors, shape (e,)
+    gained: float = np.inf  # nats, by the last improvement
+    further: int = 0  # steps since the last improvement
+    taken_so_far: int = 0  # steps in all
 
     @classmethod
     def begin(cls, one: Refitted) -> Steps:

@@ -25,18 +25,12 @@ _UNTOUCHED = 0.5  # of what an effect does to a statistic, the most by which oth
 
 @dataclass(frozen=True)
 class Contender:
-    """An effect that could stand in the place of a chosen one.
-
-    Attributes:
-        score: log score of the best set with it in that place, relative to the chosen set, nats.
-        stderr: of that score, nats.
-        probability: among all that could stand there.
-    """
+    """An effect that could stand in the place of a chosen one."""
 
     effect: Effect
-    score: float
-    stderr: float
-    probability: float
+    score: float  # log score of the best set with it in that place, relative to the chosen set, nats
+    stderr: float  # of that score, nats
+    probability: float  # among all that could stand there
 
 
 @dataclass(frozen=True)

@@ -103,22 +103,14 @@ class Trial:
 
 @dataclass
 class Search:
-    """Sets of effects that are tried.
-
-    Attributes:
-        likelihood: of the pixels' histograms, which brings a set near its best.
-        trials: all sets.
-        limit: what was next when the budget was used; None: it is not.
-        rejected: sets that are not established.
-        report: is given the tags of the best set after each step.
-    """
+    """Sets of effects that are tried."""
 
     refitter: Refitter
-    likelihood: HistogramLikelihood
-    trials: list[Trial] = field(default_factory=list)
-    limit: EffortSpentError | None = None
-    rejected: list[Refitted] = field(default_factory=list)
-    report: Callable[[str], None] = lambda _: None
+    likelihood: HistogramLikelihood  # of the pixels' histograms, which brings a set near its best
+    trials: list[Trial] = field(default_factory=list)  # all sets
+    limit: EffortSpentError | None = None  # what was next when the budget was used; None: it is not
+    rejected: list[Refitted] = field(default_factory=list)  # sets that are not established
+    report: Callable[[str], None] = lambda _: None  # is given the tags of the best set after each step
     _tuned: set[frozenset[str]] = field(default_factory=set, repr=False)
 
     @property
