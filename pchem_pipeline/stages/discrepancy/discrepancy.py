@@ -84,7 +84,7 @@ def _run_frames(
     search = _Search(context, source, model, roi, Survey(), progress)
     settings, whole = search.survey()
     window, found = search.found(settings, "")
-    elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
+    elsewhere = search.elsewhere(settings, "elsewhere-", window, found, whole)
     if elsewhere is not None and elsewhere.deviates and whole != settings:
         context.note(
             f"the model found does not hold in {elsewhere.words()}: {elsewhere.deviates}; comparing "
@@ -174,10 +174,23 @@ class _Search:
         return window, found
 
     def elsewhere(
-        self, settings: DiscrepancySettings, prefix: str, window: Window, found: Discrepancy
+        self,
+        settings: DiscrepancySettings,
+        prefix: str,
+        window: Window,
+        found: Discrepancy,
+        whole: DiscrepancySettings | None = None,
     ) -> Elsewhere | None:
-        """Test effects that explain everything in another window; None: there are none, or no window."""
-        other = other_window(window, self.source.shape, self.roi)
+        """Test effects that explain everything in more samples, or else in another window.
+
+        A weak effect beside a strong one shows only there. None: there are no such effects, or no others than
+        the samples in which they were found. ``whole``: all that may be compared, if these were fewer.
+        """
+        shape, roi = self.source.shape, self.roi
+        if whole is None or whole == settings:
+            other = other_window(window, shape, roi)
+        else:
+            other = choose_window(shape, whole, roi, self.seen)
         if other is None or found.verdict.verdict != "named":
             return None
         self.progress("checking the model in another window")

@@ -194,9 +194,13 @@ def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
     settings = DiscrepancySettings(max_samples=1 << 16, max_pixels=256)
     window, found = search.found(settings, "")
     assert search.work == 30.0
-    assert search.elsewhere(settings, "elsewhere-", window, found) is not None
+    there = search.elsewhere(settings, "elsewhere-", window, found)
+    assert there.rows != (0, 32)
     search.found(settings, "whole-")
     assert search.work == pytest.approx(65.0)
+    # a weak effect beside a strong one shows in more samples
+    there = search.elsewhere(settings, "elsewhere-", window, found, DiscrepancySettings())
+    assert there.rows == there.columns == (0, 32)
 
 
 def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
