@@ -75,7 +75,7 @@ def test_bytes_behind_an_array_are_told(tmp_path):
         np.save(file, frames())
     stack = open_frames(InputSettings(files=(str(path),)), tmp_path)
     assert stack.shape[0] == 6
-    assert "992 bytes after the array" in stack.notes[0]
+    assert "992 bytes after the array" in stack.report.notes[0]
 
 
 def test_a_zarr_array_that_claims_to_be_huge(tmp_path):

@@ -424,8 +424,7 @@ def _parts_sentence(name: str, parts: Parts) -> str:
         place = " and ".join(f"{name} {a} to {b - 1}" for name, (a, b), all_of in ends if len(all_of) > 1)
         places.append(f"{place}: {median}")
     listed = ", ".join(places)
-    cure = "the median over the sensor describes no part; report.regions gives those of parts with errors"
-    return f"{words.capitalize()} has a step ({listed}): {cure}."
+    return f"{words.capitalize()} has a step ({listed}): the median over the sensor describes no part."
 
 
 def _agreement(data: ReportData) -> Iterator[Flag]:
