@@ -274,6 +274,8 @@ def test_nights_of_one_camera(shell, finished, monkeypatch):
     said = lines(5, *limits)
     assert said[0] == "night5.zarr since the reference night0.zarr:"
     assert said[-1] == "night5.zarr since the last run night4.zarr: no change beyond the limits"
+    other_capture(store, seed=205, noise=1.0)  # night 5 again: the last run is the night before
+    assert any("since the last run night4.zarr" in line for line in lines(5, *limits))
     assert lines(5, "bias=2.5", "pixels=100%") == []
     # the limits of the reference's YAML are those of the command line
     shutil.rmtree(shell.folder / "night4.zarr")
@@ -284,8 +286,8 @@ def test_nights_of_one_camera(shell, finished, monkeypatch):
     [pair] = pages[-1].pairs  # the last run is gone
     assert sentence_of(pages[-1]).endswith("all that has a limit is within it: bias.")
     assert pair.limits == {"bias": 3.0}
-    assert [row["run"] for row in pages[-1].history] == [f"../night{n}.zarr" for n in range(6)]
-    assert len(history.read_text().splitlines()) == 1 + 6
+    assert [row["run"] for row in pages[-1].history] == [f"../night{n}.zarr" for n in (*range(6), 5)]
+    assert len(history.read_text().splitlines()) == 1 + 7
 
 
 def test_bad_input_gets_one_line(shell, finished):

@@ -130,8 +130,8 @@ def comparison_of(
     between = partial(
         _pair, tolerance=tolerance, rate=rate, limits=_limits(first.target, limits), reporter=reporter
     )
-    kept = read_history(folder / HISTORY)
-    rows = {row["id"]: row for row in kept if row["reference"] == first.facts.identity}
+    reference, file = first.facts.identity, folder / HISTORY
+    rows = {row["id"]: row for row in read_history(file) if row["reference"] == reference}
     before = _before(given, rows, folder, reporter)
     sides = [*given[:-1], *([] if before is None or before in given else [before]), last]
     names = _shortest_names([side.store.path for side in sides])
@@ -145,14 +145,12 @@ def comparison_of(
         there = rows.get(row["id"]) or new.setdefault(row["id"], row)
         if label and there["label"] != row["label"]:
             raise ConfigError(
-                f"--label {label}: this run is {there['label']} in {folder / HISTORY}; choose another "
-                "--output"
+                f"--label {label}: this run is {there['label']} in {file}; choose another --output"
             )
     if before is not None:
         pairs.append(between(before, last, "last run"))
-    history = [*rows.values(), *new.values()]
-    facts = [side.facts for side in sides]
-    return Comparison(facts, pairs, tolerance, history, rate), list(new.values())
+    facts, added = [side.facts for side in sides], list(new.values())
+    return Comparison(facts, pairs, tolerance, [*rows.values(), *added], rate), added
 
 
 @dataclass(eq=False)
@@ -180,19 +178,22 @@ def _limits(reference: Target, given: Sequence[str]) -> dict[str, float | str]:
 def _before(
     given: Sequence[_Side], rows: Mapping[str, HistoryRow], folder: Path, reporter: Reporter
 ) -> _Side | None:
-    """Return the run before the last one in the history; None where it is the reference, or gone."""
-    order = list(dict.fromkeys([*rows, *(side.facts.identity for side in given)]))
-    wanted = order[max(order.index(given[-1].facts.identity) - 1, 0)]
-    if wanted == order[0]:
-        return None
-    for side in given:
+    """Return the run before the last one in the history; None where it is the reference, or gone.
+
+    Lines of the last one as it was before it was redone do not count.
+    """
+    known = {side.facts.identity: side for side in given}
+    places = {each: place_of(row["run"], folder).resolve() for each, row in rows.items()}
+    last, own = given[-1].facts.identity, given[-1].store.path.resolve()
+    order = [each for each in dict.fromkeys([*rows, *known]) if each == last or places.get(each) != own]
+    wanted = order[max(order.index(last) - 1, 0)]
+    if wanted == order[0] or wanted in known:
+        return None if wanted == order[0] else known[wanted]
+    with contextlib.suppress(ConfigError, StoreError):
+        side = _side(places[wanted])
         if side.facts.identity == wanted:
             return side
     place = rows[wanted]["run"]
-    with contextlib.suppress(ConfigError, StoreError):
-        side = _side(place_of(place, folder).resolve())
-        if side.facts.identity == wanted:
-            return side
     reporter.info(
         f"the last run in {folder / HISTORY}, {place}, is gone or another one: not compared with it"
     )

@@ -31,6 +31,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.files import read_json, write_atomic
+from pchem_pipeline.store.lock import locked
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
 
@@ -114,20 +115,23 @@ def read_history(path: Path) -> list[HistoryRow]:
 
 
 def append_history(path: Path, rows: Sequence[HistoryRow]) -> None:
-    """Add lines to a history; existing ones stay as they are.
+    """Add those lines that a history does not have yet; existing ones stay as they are.
 
     Raises:
+        LockedError: another process adds lines.
         StoreError: the file cannot be written.
     """
-    old = path.read_bytes() if path.exists() else b""
-    columns = list((read_history(path) or rows)[0])
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
-    if not old:
-        writer.writeheader()
-    writer.writerows(rows)
-    end = b"\n" if old and not old.endswith(b"\n") else b""
-    write_atomic(path, old + end + text.getvalue().encode())
+    with locked(path, path.parent / ".pchem"):  # what others added since the comparison began stays
+        kept, old = read_history(path), path.read_bytes() if path.exists() else b""
+        there = {(row["id"], row["reference"]) for row in kept}
+        columns = list((kept or rows)[0])
+        writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
+        if not old:
+            writer.writeheader()
+        writer.writerows(row for row in rows if (row["id"], row["reference"]) not in there)
+        end = b"\n" if old and not old.endswith(b"\n") else b""
+        write_atomic(path, old + end + text.getvalue().encode())
 
 
 def _date(store: RunStore, camera: CameraFacts) -> str:

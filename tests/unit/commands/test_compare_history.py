@@ -1,5 +1,9 @@
 """The history file: a line for each run, and what it refuses."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from pchem_pipeline.base.errors import StoreError
@@ -26,6 +30,17 @@ def test_lines_are_added_and_those_there_stay(tmp_path):
     assert [each["id"] for each in read_history(path)] == ["a", "b", "c"]
 
 
+def test_two_processes_add_a_line_once(tmp_path):
+    path = tmp_path / "history.csv"
+    code = "import sys; sys.path.insert(0, sys.argv[1]); from test_compare_history import *\n"
+    code += "for name in 'abcdefgh': append_history(Path(sys.argv[2]), [row(name), row(name + sys.argv[3])])"
+    here = str(Path(__file__).parent)
+    started = [subprocess.Popen([sys.executable, "-c", code, here, path, one]) for one in "12"]
+    assert [each.wait() for each in started] == [0, 0]
+    expected = [name + one for name in "abcdefgh" for one in ("", "1", "2")]
+    assert sorted(each["id"] for each in read_history(path)) == expected
+
+
 def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "history.csv"
     append_history(path, [row("a")])
@@ -39,7 +54,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         append_history(path, [row("b")])
     assert path.read_bytes() == before
-    assert [each.name for each in tmp_path.iterdir()] == ["history.csv"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == [".pchem", "history.csv"]
 
 
 HEAD = "label,date,run,bias_median,id,reference"
