@@ -53,16 +53,8 @@ from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 
-_ENSEMBLE = (
-    "dn",
-    "counts",
-    "density",
-    "epcd_exact",
-    "electrons",
-    "nuced_counts",
-    "nuced_density",
-    "nuced_exact",
-)
+_NUCED = ("electrons", "nuced_counts", "nuced_density", "nuced_exact")
+_ENSEMBLE = ("dn", "counts", "density", "epcd_exact", *_NUCED)
 
 
 def compare_runs(
