@@ -10,8 +10,6 @@ import shlex
 from enum import IntEnum
 from pathlib import Path
 
-from pydantic_core import ValidationError
-
 #: Extra to the libraries that it installs, as ``pyproject.toml`` has them.
 EXTRAS = {
     "fits": ("astropy>=6.1",),
@@ -74,6 +72,8 @@ class PchEmError(Exception):
 
 def error_words(error: BaseException) -> str:
     """Return an error in one line: ours as it is, of settings the first complaint, others with their kind."""
+    from pydantic_core import ValidationError  # a tenth of the start of the program
+
     if isinstance(error, ValidationError):
         first = error.errors()[0]
         words = first["msg"].removeprefix("Value error, ")

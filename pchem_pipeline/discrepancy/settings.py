@@ -35,8 +35,8 @@ class DiscrepancySettings(Section):
         default=1 << 22,
         ge=1 << 14,
         description="smaller limit that is used if so many samples (or two or four times as many) disagree "
-        "by 15 sigma with a model without effects: faster, but strengths are less precise and weaker effects "
-        "may be missed; set it to max_samples to compare all",
+        "by 15 sigma with a model without effects: faster, but strengths are less precise; what is named is "
+        "tested in max_samples; set it to max_samples to search in all",
     )
     max_pixels: int = Field(
         default=1 << 13,

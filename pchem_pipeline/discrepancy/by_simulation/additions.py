@@ -194,8 +194,8 @@ class Extension:
                 closes = bool(fit.factors[-1] > 0.0)
                 found[hypothesis.tag] = _Other(hypothesis.effect, behind, mean, rest, closes)
         ranked = sorted(found.values(), key=lambda other: other.behind)
-        first = {other.effect.tag: other for other in ranked if other.effect.tag not in own}
-        return sorted(first.values(), key=lambda other: -other.behind)
+        likeliest = {other.effect.tag: other for other in ranked if other.effect.tag not in own}
+        return sorted(likeliest.values(), key=lambda other: -other.behind)
 
     def _rival(self, other: _Other, later: FloatArray) -> Rival:
         """Return a rival with its gap without ``later`` effects, and what speaks against it."""

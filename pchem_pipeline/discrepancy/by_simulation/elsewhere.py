@@ -1,4 +1,4 @@
-"""Test of the final model in another window: what is larger than a window may look like something else."""
+"""Test of the final model in other samples: what is weak, or larger than a window, shows only there."""
 
 from __future__ import annotations
 

@@ -146,8 +146,8 @@ class _Search:
             few = fewer_samples(self.source, settings, self.roi, seen, self.model)
             if few != settings:
                 context.note(
-                    f"clear disagreement in {few.max_samples:,} samples, so no more are compared; for "
-                    "smaller errors and weaker effects raise discrepancy.clear_samples"
+                    f"clear disagreement in {few.max_samples:,} samples, so the search takes no more; for "
+                    "smaller errors raise discrepancy.clear_samples"
                 )
                 seen = scanned(few)
             known = {"window": _amounts(few), "whole": _amounts(settings), **seen.numbers()}
@@ -193,7 +193,7 @@ class _Search:
             other = choose_window(shape, whole, roi, self.seen)
         if other is None or found.verdict.verdict != "named":
             return None
-        self.progress("checking the model in another window")
+        self.progress("testing the model in other samples")
         frames = FrameStack.of(
             read_window(self.source, other), other.times, settings.block_frames, **self._taken(other)
         )
