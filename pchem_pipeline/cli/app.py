@@ -219,7 +219,8 @@ def info(
     """List formats and effects, or describe camera files."""
     from pchem_pipeline.commands.info import about_files, about_program
 
-    say("\n".join(about_files(places) if places else about_program()))
+    for line in about_files(places) if places else about_program():
+        say(line)
 
 
 @_command("Look at results")

@@ -82,7 +82,7 @@ class FrameReader(ABC):
     @classmethod
     def recognises(cls, path: Path, head: bytes) -> bool:
         """Tell from the first bytes (at most 64; none for a folder) whether this reader is for the file."""
-        return any(head.startswith(magic) for magic in cls.magic)
+        return head.startswith(cls.magic)
 
     @abstractmethod
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
@@ -175,8 +175,10 @@ def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks")
 
 
 @contextmanager
-def sound(path: Path, what: str) -> Iterator[None]:
+def sound(path: Path, what: str, magic: tuple[bytes, ...] = ()) -> Iterator[None]:
     """Turn what a library says of a damaged file into one line: damage can break it anywhere.
+
+    The first bytes are one of ``magic``, if there is any.
 
     Raises:
         InputError: in place of all but our own errors and a lack of memory.
@@ -188,9 +190,12 @@ def sound(path: Path, what: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, FileNotFoundError | PermissionError) and error.strerror:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-        raise InputError(
-            f"{path}: not a valid {what}, or truncated ({error_words(error)}); copy it again"
-        ) from error
+        words = f"{path}: not a valid {what}, or truncated ({error_words(error)}); copy it again"
+        if magic and path.is_file():
+            with path.open("rb") as stream:
+                if not stream.read(64).startswith(magic):
+                    words = f"{path}: does not begin as {what}s do; correct its name, or copy it again"
+        raise InputError(words) from error
 
 
 def changed(path: Path, what: str) -> InputError:

@@ -157,7 +157,7 @@ class ContiguousReader(FrameReader):
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
         reader = cls()
-        with sound(path, cls.kind):
+        with sound(path, cls.kind, cls.magic):
             reader._inspect(path, settings)
         reader.notes += axes_notes(path, reader._full)
         return reader

@@ -55,8 +55,8 @@ class DcimgReader(ContiguousReader):
         size = path.stat().st_size
         with path.open("rb") as stream:
             head = stream.read(_FILE.size)
-            if len(head) < _FILE.size or not head.startswith(_MAGIC):
-                raise InputError(f"{path}: truncated, or not DCIMG; copy the file again")
+            if not head.startswith(_MAGIC):
+                raise ValueError
             version, sessions, session = _FILE.unpack(head)
             if version != _OLD and version < _NEW:
                 raise InputError(f"{path}: DCIMG of unknown version {version:#x}; export it as TIFF")

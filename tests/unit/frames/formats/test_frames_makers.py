@@ -56,7 +56,7 @@ def test_spe_refusals(tmp_path):
     path = tmp_path / "a.spe"
     good = spe_bytes(STACK, version=3.0, numbers=NUMBERS)
     for data, words in (
-        (good[:4000], "truncated, or not SPE"),
+        (good[:4000], "truncated before its footer"),
         (spe_bytes(STACK)[:-1], r"truncated: 5 frames need 5530 bytes, the file has 5529 \(4 complete"),
         (good[:5600], "truncated before its footer"),
         (good[:-40], "not a valid SPE file, or truncated"),
