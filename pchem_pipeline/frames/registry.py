@@ -121,8 +121,12 @@ def detect_format(path: Path) -> str:
     if not head and not path.is_dir():
         raise InputError(f"{path}: the file is empty; copy it again or omit it")
     for reader in readers():
-        if reader.recognises(path, head):
-            return reader.format_name
+        try:
+            if reader.recognises(path, head):
+                return reader.format_name
+        except Exception as error:  # a plug-in may raise anything
+            name = f"{reader.format_name!r} ({reader.__module__})"
+            _warn(f"the reader {name} failed: {error_words(error)}; repair or uninstall that package")
     by_suffix = frame_suffixes().get(path.suffix.lower())
     if by_suffix != "raw":  # raw samples may begin like anything
         check_unpacked(path, head)
