@@ -44,7 +44,9 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> Flo
         some = rows if field == "readout" else _WHOLE
         found[field] = output.read(f"applied/{name}", (slice(t0, t1), some, _WHOLE))
     readout = found.pop("readout", np.float32(0.0))
-    return Offsets(**found).of_samples(job.modes, rows) + readout
+    offsets = Offsets(**found).of_samples(job.modes, rows)
+    offsets += readout
+    return offsets
 
 
 def _calibration(
