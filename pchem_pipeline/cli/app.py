@@ -160,8 +160,7 @@ def joint(
     from pchem_pipeline.commands.first_screen import run_to_first_screen
     from pchem_pipeline.commands.new_run import find_joint
 
-    levels = () if level is None else _listed(level, "--level")
-    target, is_new = find_joint(targets, bias or [], store, against, levels)
+    target, is_new = find_joint(targets, bias or [], store, against, _listed(level or "", "--level"))
     stages = pipeline_of(target.config)
     run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 
@@ -490,8 +489,7 @@ def main(arguments: list[str] | None = None) -> None:
         _fail(f"ulimit -v {limit >> 10}: {_ADDRESSES >> 10} or more are needed; raise it", ExitCode.USAGE)
     prepare_environment()
     os.environ["MPLBACKEND"] = "Agg"  # figures go into files
-    # numba would go on, with pages of warnings
-    warnings.filterwarnings("error", module="numba.core.config")
+    warnings.filterwarnings("error", module="numba.core.config")  # it would go on
     call: Any = app
     try:
         call(args=arguments, prog_name="pchem")

@@ -20,14 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import (
-    ConfigError,
-    MissingDependencyError,
-    PchEmError,
-    StoreError,
-    install_hint,
-    quoted,
-)
+from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted, require
 from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.commands.figures import gather_run, millimetres
@@ -75,20 +68,8 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         ConfigError: the path is neither a YAML file nor a store.
         StoreError: there is no run, or it is damaged.
     """
-    require_xarray("open_run")
+    require("xarray", "notebook", "open_run")
     return Run(find_run(Path(path)))
-
-
-def require_xarray(what: str) -> None:
-    """Check that xarray can be imported.
-
-    Raises:
-        MissingDependencyError: it cannot.
-    """
-    try:
-        import xarray as _  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(f"{what} needs another package: {install_hint('notebook')}") from error
 
 
 class Run:
@@ -340,16 +321,16 @@ class Run:
         wanted = ApplySettings(kinds_of(what), prior)
         with tempfile.TemporaryDirectory(prefix="pchem-") as folder:
             place = Path(folder, "applied.zarr") if output is None else Path(output)
-            files, target, words = paths_of(frames), self._target, ("", "")
+            files, target, path, words = paths_of(frames), self._target, "", ""
             if files is None:
                 stack, target = stack_of(frames, least=1), target.changed("input", format="npy")
                 files = [str(write_stack(place.with_name(f"{place.name}-frames.npy"), stack))]
-                words = files[0], f"array of shape {tuple(stack.shape)}"
+                path, words = files[0], f"array of shape {tuple(stack.shape)}"
             command = Command(force=force, quiet=True, progress="off")
             try:
                 [place] = apply_to_frames(target, files, place, wanted, command)
             except PchEmError as error:
-                raise type(error)(str(error).replace(*words)) from None
+                raise type(error)(str(error).replace(path, words)) from None
             found = self._lazy(RunStore.open(place), "applied")
             return found.load() if output is None else found
 

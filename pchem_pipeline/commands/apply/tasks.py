@@ -36,10 +36,8 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> Flo
     """Return the offset of each sample of some rows of some frames, DN; empty where there are none."""
     if not job.removed:
         return np.zeros((0, 0, 0), np.float32)
-    _, ny, nx = job.source.shape
-    found: Any = {
-        name: np.zeros((t1 - t0, len(job.modes.parts), n)) for name, n in (("rows", ny), ("columns", nx))
-    }
+    lines, (_, ny, nx) = (t1 - t0, len(job.modes.parts)), job.source.shape
+    found: Any = {"rows": np.zeros((*lines, ny)), "columns": np.zeros((*lines, nx))}
     for name, field in job.modes.stored.items():
         some = rows if field == "readout" else _WHOLE
         found[field] = output.read(f"applied/{name}", (slice(t0, t1), some, _WHOLE))

@@ -45,7 +45,6 @@ class DcimgReader(ContiguousReader):
     """DCIMG files with monochrome frames of 8 or 16 bits."""
 
     format_name = "dcimg"
-    kind = "DCIMG file"
     suffixes: ClassVar[tuple[str, ...]] = (".dcimg",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
     #: of samples that are stored apart: byte of those of the first frame, bytes to the next, row, columns

@@ -36,7 +36,6 @@ class SerReader(ContiguousReader):
     """Monochrome or Bayer SER video, 1 to 16 bits."""
 
     format_name = "ser"
-    kind = "SER file"
     suffixes: ClassVar[tuple[str, ...]] = (".ser",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
 

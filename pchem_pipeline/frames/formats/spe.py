@@ -48,7 +48,6 @@ class SpeReader(ContiguousReader):
     """SPE files with one region of interest."""
 
     format_name = "spe"
-    kind = "SPE file"
     suffixes: ClassVar[tuple[str, ...]] = (".spe",)
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:

@@ -78,7 +78,7 @@ def check_chain(path: Path, size: int) -> None:
 
 def _broken_chain(path: Path, pages: int, size: int) -> InputError:
     if not pages:
-        return InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
+        return InputError(f"{path}: not a valid tiff file, or truncated (no pages); copy it again")
     return InputError(
         f"{path}: truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it "
         "again"

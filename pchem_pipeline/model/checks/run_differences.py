@@ -61,14 +61,11 @@ def compare_blocks(
     array, ``scale``, since many values are differences of large ones; between integers none does.
     """
     if one.dtype.kind not in "fc" and other.dtype.kind not in "fc":
-        apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
-        unequal = one != other
-        n = int(np.count_nonzero(unequal))
-        return BlockDifference(one.size, n, n, float(np.max(apart, initial=0.0, where=unequal)))
+        tolerance = -1.0
     a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         apart = np.abs(a - b)
-    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    same = (one == other) | (np.isnan(a) & np.isnan(b))
     close = same | (apart <= tolerance * scale)
     known = ~same & np.isfinite(apart)
     largest = float(np.max(apart, initial=0.0, where=known))
@@ -251,14 +248,12 @@ def reasons_of_change(
 ) -> Reasons:
     """Judge two independent measurements of a map, from so many frames.
 
-    ``kept`` is the share of good fits in either run among the pixels that have one in the other.
-
     Where all values moved by just the limit, ``z`` less the limit is N(0, 1): its median has standard error
     ``sqrt(pi / 2 n)``, its robust standard deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust
     Statistics*, 2019, Sec. 2.5), to which a tenth is added since the standard errors are estimates. The
     bias of the estimates falls as 1/N, and is not the same in runs of unlike numbers N of frames. Where a
-    share f of N(0, 1) is kept, from one end on, its mean is ``phi(Phi^-1(f)) / f``: so far at most are the
-    estimates of the pixels off that are not flagged.
+    share f of N(0, 1) is kept, from one end on, its mean is ``phi(Phi^-1(f)) / f``: at most so far off are
+    the estimates where of the good fits in the other run a share ``kept`` is good in this one, too.
     """
     n = found.n_counted
     if n < 2:

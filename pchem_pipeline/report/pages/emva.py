@@ -103,9 +103,6 @@ def emva_rows(
 
     gain, exposure = of("conversion_gain"), stored["quanta_exposure"]
     hot = defects.counts().get("hot", 0) / max(int(np.isfinite(exposure).sum()), 1)
-    current: tuple[float | None, float | None] = (None, None)
-    if kind == "dark" and "dark_current" in stored and kept.any():
-        current = _mean(stored["dark_current"][kept])
     rows = [
         EmvaRow(
             "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",
@@ -132,8 +129,8 @@ def emva_rows(
             "not in EMVA: K is one number for the sensor; PRNU combines gain and sensitivity",
         ),
         EmvaRow(
-            "dark current from mean", "mu_I.mean", *current, "e-/px/s",
-            "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
+            "dark current from mean", "mu_I.mean", *_mean(of("dark_current" if kind == "dark" else "")),
+            "e-/px/s", "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
             "EMVA: slope of the mean dark signal over six or more exposure times",
         ),
         EmvaRow(
@@ -142,14 +139,12 @@ def emva_rows(
             "EMVA: the application sets the limit of defect pixels, on the logarithmic histogram",
         ),
     ]  # fmt: skip
-    missing = "needs calibrated light", "needs exposures up to saturation"
+    missing = [("not determined", f"needs {x}") for x in ("calibrated light", "exposures up to saturation")]
     rows += [
-        EmvaRow("quantum efficiency", "eta", None, None, "%", "not determined", missing[0]),
-        EmvaRow(
-            "absolute sensitivity threshold", "mu_p.min", None, None, "photons", "not determined", missing[0]
-        ),
-        EmvaRow("saturation capacity", "mu_e.sat", None, None, "e-", "not determined", missing[1]),
-        EmvaRow("dynamic range", "DR", None, None, "", "not determined", missing[1]),
+        EmvaRow("quantum efficiency", "eta", None, None, "%", *missing[0]),
+        EmvaRow("absolute sensitivity threshold", "mu_p.min", None, None, "photons", *missing[0]),
+        EmvaRow("saturation capacity", "mu_e.sat", None, None, "e-", *missing[1]),
+        EmvaRow("dynamic range", "DR", None, None, "", *missing[1]),
     ]
     ladder = [] if samples is None else _ladder_rows(samples, kept, of, prnu)
     measured_there = {row.symbol for row in ladder}

@@ -248,8 +248,8 @@ def test_ser(tmp_path):
     [
         (ser_bytes(STACK, 16, colour=100), r"colour video \(ColorID 100\); record raw"),
         (ser_bytes(STACK, 33), "damaged header"),
-        (b"text" * 999, r"a\.ser: does not begin as SER files do; correct its name"),
-        (ser_bytes(STACK, 16)[:100], "not a valid SER file, or truncated"),
+        (b"text" * 999, r"a\.ser: does not begin as ser files do; correct its name"),
+        (ser_bytes(STACK, 16)[:100], "not a valid ser file, or truncated"),
         (ser_bytes(STACK, 16)[:-1], r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 compl"),
     ],
     ids=range(5),
