@@ -6,6 +6,7 @@ it gets a word in ``fit_status``.
 
 from __future__ import annotations
 
+import importlib
 import shlex
 from enum import IntEnum
 from pathlib import Path
@@ -107,6 +108,18 @@ class ChangedError(PchEmError):
     """A comparison of runs found that something changed."""
 
     exit_code = ExitCode.INCOMPLETE
+
+
+def require(module: str, extra: str, what: str) -> None:
+    """Check that an optional library can be imported.
+
+    Raises:
+        MissingDependencyError: it cannot; the message names the libraries to install.
+    """
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise MissingDependencyError(f"{what}: {module} is needed; {install_hint(extra)}") from error
 
 
 class InputError(PchEmError):

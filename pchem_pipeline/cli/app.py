@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -158,8 +160,7 @@ def joint(
     from pchem_pipeline.commands.first_screen import run_to_first_screen
     from pchem_pipeline.commands.new_run import find_joint
 
-    levels = () if level is None else _listed(level, "--level")
-    target, is_new = find_joint(targets, bias or [], store, against, levels)
+    target, is_new = find_joint(targets, bias or [], store, against, _listed(level or "", "--level"))
     stages = pipeline_of(target.config)
     run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 
@@ -219,7 +220,8 @@ def info(
     """List formats and effects, or describe camera files."""
     from pchem_pipeline.commands.info import about_files, about_program
 
-    say("\n".join(about_files(places) if places else about_program()))
+    for line in about_files(places) if places else about_program():
+        say(line)
 
 
 @_command("Look at results")
@@ -463,6 +465,8 @@ def _not_imported(error: Exception) -> str:
     return found
 
 
+#: Bytes of addresses that the libraries and threads of a small run take: 1.1 GiB on two processors.
+_ADDRESSES = 1200 << 20
 #: What a full or broken disk answers.
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -477,7 +481,15 @@ def main(arguments: list[str] | None = None) -> None:
             "Python runs without assertions, which libraries need; unset PYTHONOPTIMIZE or omit -O",
             ExitCode.USAGE,
         )
+    if sys.getfilesystemencoding() != "utf-8":  # names of files would be wrong: begin anew
+        os.environ["PYTHONUTF8"] = "1"
+        os.execv(sys.executable, [sys.executable, "-P", "-m", "pchem_pipeline", *(arguments or sys.argv[1:])])
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if 0 <= limit < _ADDRESSES:
+        _fail(f"ulimit -v {limit >> 10}: {_ADDRESSES >> 10} or more are needed; raise it", ExitCode.USAGE)
     prepare_environment()
+    os.environ["MPLBACKEND"] = "Agg"  # figures go into files
+    warnings.filterwarnings("error", module="numba.core.config")  # it would go on
     call: Any = app
     try:
         call(args=arguments, prog_name="pchem")
@@ -498,8 +510,9 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if not (library := _not_imported(error)):
             raise
+        reason = str(error).partition("\nThe parse failed")[0]
         _fail(
-            f"{library} cannot be imported ({error}); correct the configuration file or the variable of the "
+            f"{library} cannot be imported ({reason}); correct the configuration file or the variable of the "
             "environment that it reads, or install it again",
             ExitCode.USAGE,
         )

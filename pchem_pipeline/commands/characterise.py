@@ -21,9 +21,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import require
 from pchem_pipeline.commands.in_memory import stack_of, write_stack
 from pchem_pipeline.commands.new_run import settings_of, stated_run
-from pchem_pipeline.commands.notebook import Run, open_run, require_xarray
+from pchem_pipeline.commands.notebook import Run, open_run
 from pchem_pipeline.config.load import dump_config, write_config
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
@@ -70,7 +71,7 @@ def characterise(
             run with other settings.
         IncompleteRunError: more pixels have no value than the settings allow; the store has the run.
     """
-    require_xarray("characterise")
+    require("xarray", "notebook", "characterise")
     frames = stack_of(frames, least=2)
     with contextlib.ExitStack() as removal:
         if store is None:

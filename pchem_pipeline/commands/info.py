@@ -13,6 +13,7 @@ import numpy as np
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.kernel_cache import cache_folder
+from pchem_pipeline.base.wording import count
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
@@ -46,7 +47,7 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
     """Yield a line for each camera file, or successive ones that are alike: what it is, or why it is unread.
 
     Raises:
-        InputError: files are missing, or a folder has none.
+        InputError: files are missing or unread, a folder has none, or they are together no stack.
     """
     settings, here = InputSettings(files=tuple(map(str, places))), Path.cwd()
     if is_histogram_input(settings, here):
@@ -60,16 +61,13 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
         first, *others = alike
         more = f" to {others[-1].name} ({1 + len(others)} files, each)" if others else ""
         yield f"{first}{more}: {said}"
-    if not report.good:
-        yield from report.notes
-        return
-    try:
+    if report.good:
         frames = joined(readers, report, settings, here, least=1)
         yield _stack_words(frames)
         yield f"in a run, {disk_words(RunConfig(input=settings), frames)}"
-        yield from dict.fromkeys(report.notes)
-    except InputError as error:
-        yield f"together no stack: {error}"
+    yield from dict.fromkeys(report.notes)
+    if report.bad:
+        raise InputError(f"{count(len(report.bad), 'file')} cannot be used")
 
 
 def _stack_words(frames: FrameSequence) -> str:

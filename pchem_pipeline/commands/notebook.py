@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
-from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted, require
+from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.commands.figures import gather_run, millimetres
 from pchem_pipeline.commands.in_memory import paths_of, stack_of, write_stack
@@ -68,20 +68,8 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         ConfigError: the path is neither a YAML file nor a store.
         StoreError: there is no run, or it is damaged.
     """
-    require_xarray("open_run")
+    require("xarray", "notebook", "open_run")
     return Run(find_run(Path(path)))
-
-
-def require_xarray(what: str) -> None:
-    """Check that xarray can be imported.
-
-    Raises:
-        MissingDependencyError: it cannot.
-    """
-    try:
-        import xarray as _  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(f"{what} needs another package: {install_hint('notebook')}") from error
 
 
 class Run:
@@ -179,9 +167,8 @@ class Run:
         if name in self._groups:
             return self._groups[name]
         if not self._store.has(name):
-            raise StoreError(
-                f"{self.path} has no {name} yet; for the state of the run: pchem status {quoted(self.path)}"
-            )
+            there = sorted(filter(self._store.has, {each.group for each in VARIABLES.values()}))
+            raise StoreError(f"{self.path} has no group {name}; it has {', '.join(there) or 'none yet'}")
         for record in filter(None, map(self._store.records.known, STAGES)):
             for file in record.files:
                 if file.startswith(f"{name}/") and "." in file and not (self.path / file).exists():
@@ -334,12 +321,16 @@ class Run:
         wanted = ApplySettings(kinds_of(what), prior)
         with tempfile.TemporaryDirectory(prefix="pchem-") as folder:
             place = Path(folder, "applied.zarr") if output is None else Path(output)
-            files = paths_of(frames)
+            files, target, path, words = paths_of(frames), self._target, "", ""
             if files is None:
-                stack = stack_of(frames, least=1)
+                stack, target = stack_of(frames, least=1), target.changed("input", format="npy")
                 files = [str(write_stack(place.with_name(f"{place.name}-frames.npy"), stack))]
+                path, words = files[0], f"array of shape {tuple(stack.shape)}"
             command = Command(force=force, quiet=True, progress="off")
-            [place] = apply_to_frames(self._target, files, place, wanted, command)
+            try:
+                [place] = apply_to_frames(target, files, place, wanted, command)
+            except PchEmError as error:
+                raise type(error)(str(error).replace(path, words)) from None
             found = self._lazy(RunStore.open(place), "applied")
             return found.load() if output is None else found
 

@@ -10,7 +10,7 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, MissingDependencyError, install_hint
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, require
 from pchem_pipeline.compute.environment import prepare_environment, versions_of
 from pchem_pipeline.compute.executor import Executor, OnResult, Outcome, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -40,13 +40,11 @@ class DistributedExecutor(Executor):
             MissingDependencyError: dask.distributed is not installed.
         """
         try:
-            import distributed
-        except ImportError as error:
-            raise MissingDependencyError(
-                f"compute.backend: distributed needs another package: {install_hint('cluster')}"
-            ) from error
+            require("distributed", "cluster", "compute.backend: distributed")
         except ValueError as error:
             raise ConfigError(f"{error}; correct that file") from error
+        import distributed
+
         if settings.cluster is not None and settings.scheduler is None:
             raise ConfigError(
                 "compute.cluster: a run starts no such cluster; start it, and give its address or scheduler "

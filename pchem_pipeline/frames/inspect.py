@@ -84,7 +84,7 @@ def survey(
 def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     try:
         name = settings.format if settings.format != "auto" else detect_format(entry.path)
-        with sound(entry.path, f"{name} file"):  # a reader of another package may raise anything
+        with sound(entry.path, name):  # a reader of another package may raise anything
             reader = reader_class(name).open(entry.path, settings)
             entry.problem = "has no frames; omit it" if 0 in reader.shape else ""
     except InputError as error:

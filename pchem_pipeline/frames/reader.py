@@ -82,7 +82,7 @@ class FrameReader(ABC):
     @classmethod
     def recognises(cls, path: Path, head: bytes) -> bool:
         """Tell from the first bytes (at most 64; none for a folder) whether this reader is for the file."""
-        return any(head.startswith(magic) for magic in cls.magic)
+        return head.startswith(cls.magic)
 
     @abstractmethod
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
@@ -99,7 +99,7 @@ class FrameReader(ABC):
         t1 = self.shape[0] if t1 is None else t1
         y1 = self.shape[1] if y1 is None else y1
         buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
-        with sound(self.paths[0], f"{self.format_name} file"):
+        with sound(self.paths[0], self.format_name):
             self.read_into(buffer, t0, t1, y0, y1)
         return buffer
 
@@ -175,8 +175,8 @@ def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks")
 
 
 @contextmanager
-def sound(path: Path, what: str) -> Iterator[None]:
-    """Turn what a library says of a damaged file into one line: damage can break it anywhere.
+def sound(path: Path, name: str, magic: tuple[bytes, ...] = ()) -> Iterator[None]:
+    """Turn what a library says of a damaged file of a format, its first bytes its magic, into one line.
 
     Raises:
         InputError: in place of all but our own errors and a lack of memory.
@@ -188,9 +188,10 @@ def sound(path: Path, what: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, FileNotFoundError | PermissionError) and error.strerror:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-        raise InputError(
-            f"{path}: not a valid {what}, or truncated ({error_words(error)}); copy it again"
-        ) from error
+        words = f"not a valid {name} file, or truncated ({error_words(error)}); copy it again"
+        if magic and path.is_file() and not np.fromfile(path, "u1", 64).tobytes().startswith(magic):
+            words = f"does not begin as {name} files do; correct its name, or copy it again"
+        raise InputError(f"{path}: {words}") from error
 
 
 def changed(path: Path, what: str) -> InputError:

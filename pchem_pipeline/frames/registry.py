@@ -14,13 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import (
-    ConfigError,
-    InputError,
-    MissingDependencyError,
-    error_words,
-    install_hint,
-)
+from pchem_pipeline.base.errors import ConfigError, InputError, error_words
 from pchem_pipeline.frames.reader import FrameReader
 
 ENTRY_POINT_GROUP = "pchem_pipeline.readers"
@@ -121,8 +115,12 @@ def detect_format(path: Path) -> str:
     if not head and not path.is_dir():
         raise InputError(f"{path}: the file is empty; copy it again or omit it")
     for reader in readers():
-        if reader.recognises(path, head):
-            return reader.format_name
+        try:
+            if reader.recognises(path, head):
+                return reader.format_name
+        except Exception as error:  # a plug-in may raise anything
+            name = f"{reader.format_name!r} ({reader.__module__})"
+            _warn(f"the reader {name} failed: {error_words(error)}; repair or uninstall that package")
     by_suffix = frame_suffixes().get(path.suffix.lower())
     if by_suffix != "raw":  # raw samples may begin like anything
         check_unpacked(path, head)
@@ -139,17 +137,3 @@ def check_unpacked(path: Path, head: bytes) -> None:
     for magic, program in _PACKED.items():
         if head.startswith(magic):
             raise InputError(f"{path}: compressed with {program}; unpack it first")
-
-
-def require(module: str, extra: str, what: str) -> None:
-    """Check that an optional library can be imported.
-
-    Raises:
-        MissingDependencyError: it cannot; the message names the extra to install.
-    """
-    try:
-        importlib.import_module(module)
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"reading and writing {what} needs {module}; install it: {install_hint(extra)}"
-        ) from error

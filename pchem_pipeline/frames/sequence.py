@@ -179,7 +179,7 @@ class FrameSequence(FrameReader):
         rows = (rows[0] + self._y0, rows[1] + self._y0)
         for reader, first, end, offset in self.pieces(t0, t1):
             part = buffer[offset : offset + end - first]
-            with sound(reader.paths[0], f"{reader.format_name} file"):
+            with sound(reader.paths[0], reader.format_name):
                 self._read_part(reader, part, first, end, rows)
             yield reader, part
 

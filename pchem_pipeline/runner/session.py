@@ -65,7 +65,12 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     if command.dry_run:
         return _dry_run(target, stages, command)
     with working_run(target, command) as context:
-        states = [_execute(name, context, stages) for name in stages]
+        states: list[StageState] = []
+        try:
+            states.extend(_execute(name, context, stages) for name in stages)
+        except (InputError, StoreError):  # one that lacks what a failed one should have written says so, too
+            if all(state.state != "failed" for state in states):
+                raise
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
         if failed:

@@ -49,6 +49,13 @@ class CommonModes:
     in_noise: float = 0.0
     readouts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
+    @property
+    def stored(self) -> dict[str, str]:
+        """Names of the arrays of offsets that are not all 0, each with its field of :class:`Offsets`."""
+        lines = {"rows": self.variances[:, :2], "columns": self.variances[:, 2]}
+        some = {**lines, "waves": self.waves, "readout": self.readouts}
+        return {f"{name.removesuffix('s')}_offset": name for name, each in some.items() if each.any()}
+
     @classmethod
     def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
         """Return those of the effects of a model of a sensor of (rows, columns)."""

@@ -487,6 +487,7 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, shell):
     assert abs(wrong[0] / claimed - 1) < 0.2
     assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
     assert "row_offset" in found
+    assert "column_offset" not in found  # nothing is subtracted from columns
     assert "row_offset" not in kept
 
 
@@ -521,6 +522,7 @@ def test_noise_along_the_readout_is_taken_from_the_frames_with_what_was_subtract
     )
     found = opened(tmp_path / "o.zarr").load()
     good = found.quality.values == 0
+    assert not {"row_offset", "column_offset"} & set(found)
     assert np.corrcoef(found.readout_offset.values[:, good].ravel(), offset[:, good].ravel())[0, 1] > 0.5
     assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
     assert (found.electrons.values - electrons)[:, good].std() < 0.27

@@ -1,8 +1,12 @@
 """``pchem joint``: a run whose samples are runs of one sensor, from command line to report and verdict."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +19,9 @@ from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.commands.new_run import find_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import RunView
+from pchem_pipeline.config.load import write_model
 from pchem_pipeline.discrepancy.verdict import read_verdict
+from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import run_stages, run_status, up_to
@@ -149,6 +155,17 @@ def test_a_changed_time_makes_new_maps_of_the_same_fit(joint):
     assert store.records.read("fit") == record
     states = Shell(joint).states("again.zarr")
     assert all(states[stage].startswith("complete") for stage in ("ingest", "histogram", "fit", "maps"))
+
+
+def test_effects_found_in_one_run_are_carried_over(joint, tmp_path):
+    shutil.copytree(joint, tmp_path / "joint")
+    found = ModelSettings.model_validate({"effects": [{"tag": "row_noise", "row_noise_dn": 0.7}]})
+    write_model(tmp_path / "joint" / "dark_5s.yaml", found)
+    manual = (ROOT / "docs" / "howto" / "several_exposures.md").read_text(encoding="utf-8")
+    [block] = re.findall(r"```bash\n(.*?)```", manual, re.DOTALL)
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-ec", block], cwd=tmp_path / "joint", env=environment, check=True, timeout=300)
+    assert fitted_effects(RunStore.open(tmp_path / "joint" / "dark.zarr")) == found.effects
 
 
 def test_histograms_made_again_make_the_fit_stale(joint):

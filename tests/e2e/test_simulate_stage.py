@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, PchEmError, StoreError
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
@@ -149,3 +150,10 @@ def test_a_missing_section_and_a_disk_too_small_are_noticed_before_the_work(tmp_
     with pytest.raises(StoreError, match="GB are free"):
         simulated(target)
     assert not list((tmp_path / "frames").iterdir())
+
+
+def test_an_effect_that_fails_is_the_one_error(tmp_path, monkeypatch):
+    """The stages behind it find no frames, which is no news."""
+    monkeypatch.setattr(RowNoise, "apply", lambda *_: {}["lost"])
+    with pytest.raises(IncompleteRunError, match=r"^simulate: .*'row_noise' .* failed: KeyError: 'lost'"):
+        run_stages(prepare(tmp_path), ["simulate", "ingest", "histogram"], Command(quiet=True))

@@ -363,20 +363,17 @@ def _with_offsets(context: StageContext, job: Job, calibration: Calibration) -> 
     parts = job.modes.parts
     waves = job.modes.waves
     lengths, whole = {"part": len(parts), "wave": len(waves), "coefficient": 2}, {"y": ny}
-    names = ("applied/row_offset", "applied/column_offset")
-    _create(context, job, *names, lengths=lengths, chunks=whole, removed=list(job.removed))
-    if len(waves):
-        _create(
-            context,
-            job,
-            "applied/wave_offset",
-            lengths=lengths,
-            cycles_per_row=waves[:, 0].tolist(),
-            cycles_per_column=waves[:, 1].tolist(),
-            part=waves[:, 3].astype(int).tolist(),
-        )
-    if len(job.modes.readouts):
-        _create(context, job, "applied/readout_offset", chunks={"x": _chunks(job.source.shape)[2]})
+    facts: dict[str, dict[str, Any]] = {
+        "wave_offset": {
+            "cycles_per_row": waves[:, 0].tolist(),
+            "cycles_per_column": waves[:, 1].tolist(),
+            "part": waves[:, 3].astype(int).tolist(),
+        },
+        "readout_offset": {"chunks": {"x": _chunks(job.source.shape)[2]}},
+    }
+    for name in job.modes.stored:
+        own = {"lengths": lengths, "removed": list(job.removed)} | facts.get(name, {"chunks": whole})
+        _create(context, job, f"applied/{name}", **own)
     context.store.write_array("applied/offset_part", parts)
     length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (8 * ny * nx * job.depth)))
     pieces = [Piece("offsets", 0, ny, t0, min(t0 + length, n)) for t0 in range(0, n, length)]

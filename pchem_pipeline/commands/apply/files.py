@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.base.variables import Variable, variables_of
 from pchem_pipeline.commands.apply.finish import FLAGS
 from pchem_pipeline.frames.formats.fits_files import FitsImage, image_cards, input_cards, write_images
 from pchem_pipeline.frames.formats.map_files import write_tiff_cube
 from pchem_pipeline.frames.reader import FrameReader
-from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore

@@ -36,12 +36,14 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> Flo
     """Return the offset of each sample of some rows of some frames, DN; empty where there are none."""
     if not job.removed:
         return np.zeros((0, 0, 0), np.float32)
-    frames = slice(t0, t1)
-    names = ("row_offset", "column_offset", *(("wave_offset",) if len(job.modes.waves) else ()))
-    found = Offsets(*(output.read(f"applied/{name}", (frames, _WHOLE, _WHOLE)) for name in names))
-    offsets = found.of_samples(job.modes, rows)
-    if len(job.modes.readouts):
-        offsets += output.read("applied/readout_offset", (frames, rows, _WHOLE))
+    lines, (_, ny, nx) = (t1 - t0, len(job.modes.parts)), job.source.shape
+    found: Any = {"rows": np.zeros((*lines, ny)), "columns": np.zeros((*lines, nx))}
+    for name, field in job.modes.stored.items():
+        some = rows if field == "readout" else _WHOLE
+        found[field] = output.read(f"applied/{name}", (slice(t0, t1), some, _WHOLE))
+    readout = found.pop("readout", np.float32(0.0))
+    offsets = Offsets(**found).of_samples(job.modes, rows)
+    offsets += readout
     return offsets
 
 
@@ -79,12 +81,8 @@ def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]
         for start, (frames,) in stream:
             found = estimate_offsets(frames, reference, job.modes)
             region = (slice(start, start + len(frames)), _WHOLE, _WHOLE)
-            output.write("applied/row_offset", region, found.rows.astype(np.float32))
-            output.write("applied/column_offset", region, found.columns.astype(np.float32))
-            if len(job.modes.waves):
-                output.write("applied/wave_offset", region, found.waves.astype(np.float32))
-            if len(job.modes.readouts):
-                output.write("applied/readout_offset", region, found.readout.astype(np.float32))
+            for name, field in job.modes.stored.items():
+                output.write(f"applied/{name}", region, getattr(found, field).astype(np.float32))
             reached[0] |= bool((frames.min(axis=0) <= ends[0])[known].any())
             reached[1] |= bool((frames.max(axis=0) >= ends[1])[known].any())
             left += found.left.sum(axis=0)

@@ -258,11 +258,13 @@ def _pair(
     confirm = None if same_data else _common_fit(first, second)
     maps: dict[str, MapDifference] = {}
     transitions: list[list[int]] = []
+    reasons: dict[str, Reasons] = {}
     changed = compared = np.zeros(one.shape, np.bool_)
     defects = now.changes_since(before, confirm)
     if one.shape == other.shape:
         grades = before.quality.ravel(), now.quality.ravel()
-        transitions = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int).tolist()
+        moves = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int)
+        transitions, n_good = moves.tolist(), [moves[:, GOOD].sum(), moves[GOOD].sum()]
         compared = (before.quality == GOOD) & (now.quality == GOOD)
         stores = first.store, second.store
         in_both = [name for name in MEASURED_MAPS if all(store.has(f"maps/{name}") for store in stores)]
@@ -276,9 +278,11 @@ def _pair(
         changed = np.logical_or.reduce([maps[name].changed for name in judged])
         changed[[each.y for each in defects], [each.x for each in defects]] = True
         compared |= changed
+        frames = [SensorInfo.read(store).n_frames for store in stores]
+        kept = moves[GOOD, GOOD] / np.maximum(n_good, 1)
+        if limits or not same_data:
+            reasons = {name: reasons_of_change(each, frames, kept) for name, each in maps.items()}
     arrays = _compared_arrays(first.store, second.store, tolerance, reporter) if same_data else []
-    frames = [SensorInfo.read(each.store).n_frames for each in (first, second)]
-    reasons = {name: reasons_of_change(maps[name], frames) for name in maps if limits or not same_data}
     if limits:
         reasons = {
             name: replace(reasons[name], spread=False, pixels=False) for name in limits if name in reasons

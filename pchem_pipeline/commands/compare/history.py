@@ -25,7 +25,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
-from pchem_pipeline.model.maps.defects import FAULTS, Defect
+from pchem_pipeline.model.maps.defects import FAULTS, OPEN, Defect
 from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_change
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects
@@ -152,7 +152,7 @@ class PixelStates:
     """What the pixels of a run are, as its report has them; maps of shape (y, x).
 
     Attributes:
-        kinds: faults, as bits.
+        kinds: faults, and what the data leave open, as bits.
         exposure, noise: H and read noise, each with its error, e-.
         status: words of the fit.
         quality: good, caution or no value.
@@ -171,7 +171,7 @@ class PixelStates:
         exposure, noise = (
             (maps[name], maps[f"{name}_stderr"]) for name in ("quanta_exposure", "read_noise_e")
         )
-        kinds = stored_defects(store, config).kinds & np.uint16(FAULTS)
+        kinds = stored_defects(store, config).kinds & np.uint16(FAULTS | OPEN)
         return cls(kinds, exposure, noise, store.read("fit/fit_status"), maps["quality"])
 
     def defects(self) -> dict[str, int]:
@@ -185,16 +185,19 @@ class PixelStates:
     def changes_since(self, first: PixelStates, confirm: CommonFit | None = None) -> tuple[DefectChange, ...]:
         """Return the pixels whose faults differ, unless what these are seen in agrees within its error.
 
-        ``confirm`` gives p-values of pixels (y, x) for a common fit of both runs; None: not known.
+        ``confirm`` gives p-values of pixels (y, x) for a common fit of both runs; None: not known. Only it
+        tells whether a pixel changed that is flagged, or has no value, in one of them.
         """
         if self.kinds.shape != first.kinds.shape:
             return ()
         changed = self.kinds ^ first.kinds
-        changed[_near(self.exposure, first.exposure)] &= np.uint16(~(Defect.HOT | Defect.DEAD) & FAULTS)
-        changed[_near(self.noise, first.noise)] &= np.uint16(~Defect.NOISY & FAULTS)
-        y, x = np.nonzero(changed)
+        changed[_near(self.exposure, first.exposure)] &= np.uint16(~(Defect.HOT | Defect.DEAD))
+        changed[_near(self.noise, first.noise)] &= np.uint16(~Defect.NOISY)
+        faults = (changed & np.uint16(FAULTS)) != 0
+        y, x = np.nonzero(faults if confirm is None else changed)
         if confirm is not None and y.size:
-            differs = ~(confirm(y, x) > erfc(LIMIT / np.sqrt(2.0)))
+            p, most = confirm(y, x), erfc(LIMIT / np.sqrt(2.0))
+            differs = np.where(np.isnan(p), faults[y, x], p <= most)
             y, x = y[differs], x[differs]
         words = (words_of(Defect(int(kinds))) for each in (first, self) for kinds in each.kinds[y, x])
         found = np.array([*words], np.str_).reshape(2, -1)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,8 +148,6 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `_decode_into`."""
 
-    #: what a file is called that cannot be opened
-    kind: ClassVar[str] = "file"
     _offset: int | None = None
     _full: tuple[int, ...] = ()
 
@@ -157,7 +155,7 @@ class ContiguousReader(FrameReader):
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
         reader = cls()
-        with sound(path, cls.kind):
+        with sound(path, cls.format_name, cls.magic):
             reader._inspect(path, settings)
         reader.notes += axes_notes(path, reader._full)
         return reader

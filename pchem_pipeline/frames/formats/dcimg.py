@@ -45,7 +45,6 @@ class DcimgReader(ContiguousReader):
     """DCIMG files with monochrome frames of 8 or 16 bits."""
 
     format_name = "dcimg"
-    kind = "DCIMG file"
     suffixes: ClassVar[tuple[str, ...]] = (".dcimg",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
     #: of samples that are stored apart: byte of those of the first frame, bytes to the next, row, columns
@@ -55,8 +54,8 @@ class DcimgReader(ContiguousReader):
         size = path.stat().st_size
         with path.open("rb") as stream:
             head = stream.read(_FILE.size)
-            if len(head) < _FILE.size or not head.startswith(_MAGIC):
-                raise InputError(f"{path}: truncated, or not DCIMG; copy the file again")
+            if not head.startswith(_MAGIC):
+                raise ValueError
             version, sessions, session = _FILE.unpack(head)
             if version != _OLD and version < _NEW:
                 raise InputError(f"{path}: DCIMG of unknown version {version:#x}; export it as TIFF")

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.frames.camera import (
     TIME_UNIT,
     CameraFacts,
@@ -45,7 +45,7 @@ from pchem_pipeline.frames.formats.kinds import (
     windows,
 )
 from pchem_pipeline.frames.reader import changed
-from pchem_pipeline.frames.registry import check_unpacked, require
+from pchem_pipeline.frames.registry import check_unpacked
 from pchem_pipeline.frames.settings import Area, InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
@@ -81,7 +81,6 @@ class FitsReader(ContiguousReader):
 
     format_name = "fits"
     library: ClassVar[str] = "astropy"
-    kind = "FITS file"
     suffixes: ClassVar[tuple[str, ...]] = (".fits", ".fit", ".fts", ".fz")
     magic: ClassVar[tuple[bytes, ...]] = (b"SIMPLE  =",)
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import require
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.frames.reader import FrameReader
-from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
 if TYPE_CHECKING:

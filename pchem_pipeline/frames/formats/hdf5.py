@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
-from pchem_pipeline.base.errors import InputError, quoted
+from pchem_pipeline.base.errors import InputError, quoted, require
 from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.hdf5_parts import (
@@ -41,7 +41,6 @@ from pchem_pipeline.frames.formats.kinds import (
     windows,
 )
 from pchem_pipeline.frames.reader import changed, unwritten_notes
-from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -66,7 +65,6 @@ class Hdf5Reader(ContiguousReader):
 
     format_name = "hdf5"
     library: ClassVar[str] = "h5py"
-    kind = "HDF5 file"
     order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
     magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3 MAT-file")

@@ -13,9 +13,8 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.frames.formats.fits_files import FitsImage, image_cards, write_images
-from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
 #: bytes above which a TIFF file needs offsets of 64 bits

@@ -10,12 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts, bits_of, duration_of, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import check_coded
 from pchem_pipeline.frames.reader import changed
-from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 
 
@@ -24,7 +23,6 @@ class Nd2Reader(ContiguousReader):
 
     format_name = "nd2"
     library: ClassVar[str] = "nd2"
-    kind = "ND2 file"
     suffixes: ClassVar[tuple[str, ...]] = (".nd2",)
     magic: ClassVar[tuple[bytes, ...]] = (b"\xda\xce\xbe\x0a", b"\0\0\0\x0cjP  ")
 

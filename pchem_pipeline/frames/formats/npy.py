@@ -20,7 +20,6 @@ class NpyReader(ContiguousReader):
     """An array (frames, rows, columns), or one frame (rows, columns), in C order."""
 
     format_name = "npy"
-    kind = "npy file"
     order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".npy",)
     magic: ClassVar[tuple[bytes, ...]] = (b"\x93NUMPY",)

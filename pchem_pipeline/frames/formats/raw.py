@@ -105,7 +105,6 @@ class RawReader(ContiguousReader):
     """Frames as plain bytes: header, then frames of rows, each followed by padding."""
 
     format_name = "raw"
-    kind = "raw file"
     suffixes: ClassVar[tuple[str, ...]] = (".raw", ".bin", ".dat", ".dax")
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:

@@ -36,15 +36,14 @@ class SerReader(ContiguousReader):
     """Monochrome or Bayer SER video, 1 to 16 bits."""
 
     format_name = "ser"
-    kind = "SER file"
     suffixes: ClassVar[tuple[str, ...]] = (".ser",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
             head, size = stream.read(_HEADER.size), path.stat().st_size
-        if len(head) < _HEADER.size or not head.startswith(_MAGIC):
-            raise InputError(f"{path}: truncated, or not SER video; copy the file again")
+        if not head.startswith(_MAGIC):
+            raise ValueError
         _, _, colour, flag, columns, rows, depth, n, _, instrument, _, _, ticks = _HEADER.unpack(head)
         if colour in _MOSAICS:
             self.notes = (mosaic_note(path, _MOSAICS[colour]),)

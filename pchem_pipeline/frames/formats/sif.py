@@ -8,10 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts, celsius, duration_of, text_of, texts_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
-from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 
 
@@ -38,7 +37,6 @@ class SifReader(ContiguousReader):
 
     format_name = "sif"
     library: ClassVar[str] = "sif_parser"
-    kind = "SIF file"
     suffixes: ClassVar[tuple[str, ...]] = (".sif",)
     magic: ClassVar[tuple[bytes, ...]] = (b"Andor Technology Multi-Channel File\n",)
 

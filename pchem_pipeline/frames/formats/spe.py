@@ -48,14 +48,11 @@ class SpeReader(ContiguousReader):
     """SPE files with one region of interest."""
 
     format_name = "spe"
-    kind = "SPE file"
     suffixes: ClassVar[tuple[str, ...]] = (".spe",)
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
             head, size = stream.read(_HEADER_BYTES), path.stat().st_size
-        if len(head) < _HEADER_BYTES:
-            raise InputError(f"{path}: truncated, or not SPE; copy the file again")
         field = {name: struct.unpack_from(kind, head, place)[0] for name, (place, kind) in _FIELDS.items()}
         if field["samples"] not in _SAMPLES:
             raise InputError(

@@ -52,7 +52,6 @@ class TiffReader(ContiguousReader):
 
     format_name = "tiff"
     library: ClassVar[str] = "tifffile"
-    kind = "TIFF file"
     suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk", ".dng")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
@@ -70,7 +69,7 @@ class TiffReader(ContiguousReader):
                 pages = [page for page in every if not page.is_reduced]
             reduced = len(every) - len(pages)
             if not pages:
-                raise InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
+                raise ValueError("no pages")
             notes = [f"{path.name}: {reduced} reduced pages (previews) are ignored"] if reduced else []
             first = pages[0]
             _check_pages(path, pages)

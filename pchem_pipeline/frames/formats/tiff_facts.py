@@ -42,14 +42,15 @@ def check_chain(path: Path, size: int) -> None:
     """Walk from directory to directory: the library stops silently at one that is damaged, or never.
 
     Raises:
-        InputError: no TIFF file, a directory that is not within the file, or a circular chain.
+        ValueError: no TIFF file.
+        InputError: a directory that is not within the file, or a circular chain.
     """
     with path.open("rb") as stream:
         head = stream.read(16)
         order: Literal["little", "big"] = "big" if head[:2] == b"MM" else "little"
         version = int.from_bytes(head[2:4], order)
         if len(head) < 8 or head[:2] not in (b"II", b"MM") or version not in (42, 43):
-            raise InputError(f"{path}: not a valid TIFF file, or truncated (header); copy it again")
+            raise ValueError("header")
         # bytes of the count of a directory, of a tag and of a pointer; where the header names the first one
         count_bytes, tag_bytes, pointer, first = (8, 20, 8, 8) if version == 43 else (2, 12, 4, 4)
         following = int.from_bytes(head[first : first + pointer], order)
@@ -77,7 +78,7 @@ def check_chain(path: Path, size: int) -> None:
 
 def _broken_chain(path: Path, pages: int, size: int) -> InputError:
     if not pages:
-        return InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
+        return InputError(f"{path}: not a valid tiff file, or truncated (no pages); copy it again")
     return InputError(
         f"{path}: truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it "
         "again"

@@ -45,7 +45,6 @@ class ZarrReader(ContiguousReader):
 
     format_name = "zarr"
     library: ClassVar[str] = "zarr"
-    kind = "zarr store"
     suffixes: ClassVar[tuple[str, ...]] = (".zarr",)
 
     @classmethod

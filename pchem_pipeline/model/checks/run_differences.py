@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, erfc
+from scipy.special import chdtrc, erfc, ndtri
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.statistics import false_discovery
@@ -61,14 +61,11 @@ def compare_blocks(
     array, ``scale``, since many values are differences of large ones; between integers none does.
     """
     if one.dtype.kind not in "fc" and other.dtype.kind not in "fc":
-        apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
-        unequal = one != other
-        n = int(np.count_nonzero(unequal))
-        return BlockDifference(one.size, n, n, float(np.max(apart, initial=0.0, where=unequal)))
+        tolerance = -1.0
     a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         apart = np.abs(a - b)
-    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    same = (one == other) | (np.isnan(a) & np.isnan(b))
     close = same | (apart <= tolerance * scale)
     known = ~same & np.isfinite(apart)
     largest = float(np.max(apart, initial=0.0, where=known))
@@ -246,19 +243,25 @@ class Reasons:
         return self.shifted or self.spread or self.pixels
 
 
-def reasons_of_change(found: MapDifference, n_frames: Sequence[int] = (1, 1)) -> Reasons:
+def reasons_of_change(
+    found: MapDifference, n_frames: Sequence[int] = (1, 1), kept: Sequence[float] = (1.0, 1.0)
+) -> Reasons:
     """Judge two independent measurements of a map, from so many frames.
 
     Where all values moved by just the limit, ``z`` less the limit is N(0, 1): its median has standard error
     ``sqrt(pi / 2 n)``, its robust standard deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust
     Statistics*, 2019, Sec. 2.5), to which a tenth is added since the standard errors are estimates. The
-    bias of the estimates falls as 1/N, and is not the same in runs of unlike numbers N of frames.
+    bias of the estimates falls as 1/N, and is not the same in runs of unlike numbers N of frames. Where a
+    share f of N(0, 1) is kept, from one end on, its mean is ``phi(Phi^-1(f)) / f``: at most so far off are
+    the estimates where of the good fits in the other run a share ``kept`` is good in this one, too.
     """
     n = found.n_counted
     if n < 2:
         return Reasons(False, False, False)
-    share = 1.0 / np.asarray(n_frames)
+    share, f = 1.0 / np.asarray(n_frames), np.asarray(kept)
     bias = _BIAS * np.ptp(share) / np.sqrt(share.sum())
+    mean = np.exp(-0.5 * ndtri(f) ** 2) / np.sqrt(2.0 * np.pi) / f
+    bias += np.ptp(mean * np.sqrt(share / share.sum()))
     return Reasons(
         shifted=bool(found.beyond_z > bias + LIMIT * np.sqrt(np.pi / (2.0 * n))),
         spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, FloatArray
-from pchem_pipeline.base.wording import measured, short, unit_text
+from pchem_pipeline.base.wording import count, measured, short, unit_text
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
-from pchem_pipeline.model.maps.defects import Defects
+from pchem_pipeline.model.maps.defects import FAULTS, Defects
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.pages.tables import Table
 
@@ -87,18 +87,22 @@ def emva_rows(
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
 
-    def of(name: str) -> FloatArray:
-        values = stored[name][kept] if name in stored else np.empty(0)
+    def of(name: str, pixels: NDArray[Any] = kept) -> FloatArray:
+        values = stored[name][pixels] if name in stored else np.empty(0)
         return values if values.size else np.full(1, np.nan)
+
+    def prnu(name: str, symbol: str, what: str, differs: str) -> EmvaRow:
+        faultless = kept & ((defects.kinds & int(FAULTS)) == 0)
+        return EmvaRow(
+            "photo response non-uniformity", symbol,
+            *_relative_spread(of(name, faultless), of(f"{name}_stderr", faultless)), "%",
+            f"standard deviation of {what} between the pixels over its mean, corrected for errors; "
+            f"{count(int((kept & ~faultless).sum()), 'pixel')} with defects left out",
+            differs,
+        )  # fmt: skip
 
     gain, exposure = of("conversion_gain"), stored["quanta_exposure"]
     hot = defects.counts().get("hot", 0) / max(int(np.isfinite(exposure).sum()), 1)
-    response: tuple[float | None, float | None] = (None, None)
-    current = response
-    if kind == "light":
-        response = _relative_spread(of("quanta_exposure"), of("quanta_exposure_stderr"))
-    if kind == "dark" and "dark_current" in stored and kept.any():
-        current = _mean(stored["dark_current"][kept])
     rows = [
         EmvaRow(
             "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",
@@ -114,10 +118,8 @@ def emva_rows(
             "root mean square over the pixels of sigma, quantisation included", "as above",
         ),
         _dsnu(of, kind),
-        EmvaRow(
-            "photo response non-uniformity", "PRNU_1288 (similar)", *response, "%",
-            "standard deviation of H between the pixels over its mean, corrected for errors (input.kind: "
-            "light)",
+        prnu(
+            "quanta_exposure" if kind == "light" else "", "PRNU_1288 (similar)", "H (input.kind: light)",
             "EMVA: at half saturation, dark subtracted, trends of the illumination filtered out; not done "
             "here",
         ),
@@ -127,8 +129,8 @@ def emva_rows(
             "not in EMVA: K is one number for the sensor; PRNU combines gain and sensitivity",
         ),
         EmvaRow(
-            "dark current from mean", "mu_I.mean", *current, "e-/px/s",
-            "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
+            "dark current from mean", "mu_I.mean", *_mean(of("dark_current" if kind == "dark" else "")),
+            "e-/px/s", "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
             "EMVA: slope of the mean dark signal over six or more exposure times",
         ),
         EmvaRow(
@@ -137,21 +139,21 @@ def emva_rows(
             "EMVA: the application sets the limit of defect pixels, on the logarithmic histogram",
         ),
     ]  # fmt: skip
-    missing = "needs calibrated light", "needs exposures up to saturation"
+    missing = [("not determined", f"needs {x}") for x in ("calibrated light", "exposures up to saturation")]
     rows += [
-        EmvaRow("quantum efficiency", "eta", None, None, "%", "not determined", missing[0]),
-        EmvaRow(
-            "absolute sensitivity threshold", "mu_p.min", None, None, "photons", "not determined", missing[0]
-        ),
-        EmvaRow("saturation capacity", "mu_e.sat", None, None, "e-", "not determined", missing[1]),
-        EmvaRow("dynamic range", "DR", None, None, "", "not determined", missing[1]),
+        EmvaRow("quantum efficiency", "eta", None, None, "%", *missing[0]),
+        EmvaRow("absolute sensitivity threshold", "mu_p.min", None, None, "photons", *missing[0]),
+        EmvaRow("saturation capacity", "mu_e.sat", None, None, "e-", *missing[1]),
+        EmvaRow("dynamic range", "DR", None, None, "", *missing[1]),
     ]
-    ladder = [] if samples is None else _ladder_rows(samples, kept, of)
+    ladder = [] if samples is None else _ladder_rows(samples, kept, of, prnu)
     measured_there = {row.symbol for row in ladder}
     return [row for row in rows if row.symbol.removesuffix(" (similar)") not in measured_there] + ladder
 
 
-def _ladder_rows(samples: Samples, kept: NDArray[Any], of: Callable[[str], FloatArray]) -> list[EmvaRow]:
+def _ladder_rows(
+    samples: Samples, kept: NDArray[Any], of: Callable[[str], FloatArray], prnu: Callable[..., EmvaRow]
+) -> list[EmvaRow]:
     """Return what exposures at several light levels or integration times determine."""
     lit = [i for i in samples.on_line if samples.samples[i].kind == "exposed"]
     if not lit or not kept.any():
@@ -189,10 +191,8 @@ def _ladder_rows(samples: Samples, kept: NDArray[Any], of: Callable[[str], Float
     slope = next((name for name in ("charge_per_level", "charge_rate") if np.isfinite(of(name)).any()), None)
     if slope is not None:
         rows.append(
-            EmvaRow(
-                "photo response non-uniformity", "PRNU_1288",
-                *_relative_spread(of(slope), of(f"{slope}_stderr")), "%",
-                "standard deviation of the slope of H between the pixels over its mean, corrected for errors",
+            prnu(
+                slope, "PRNU_1288", "the slope of H",
                 "EMVA: at half saturation, trends of the illumination filtered out; not done here",
             )
         )  # fmt: skip

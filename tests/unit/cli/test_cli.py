@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -153,6 +154,34 @@ def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
     found = pchem("run", npy, "--store", tmp_path / "a.zarr", env=environment)
     assert (found.returncode, len(found.stderr.splitlines())) == (2, 1)
     assert f"zarr cannot be imported (A config file at '{tmp_path}/zarr.yaml' is malformed" in found.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "words"),
+    [
+        (
+            "NUMBA_NUM_THREADS=many {pchem} info",
+            2,
+            r"'NUMBA_NUM_THREADS' .* 'many' could not be parsed\.\); ",
+        ),
+        ("ulimit -v 400000; {pchem} info", 2, r"^pchem: ulimit -v 400000: \d+ or more are needed; raise it$"),
+        ("PYTHONUTF8=0 LC_ALL=C {pchem} info nähe.npy | head -1", 0, "/nähe.npy: npy, 2 frames of 3 x 4, "),
+    ],
+)
+def test_odd_surroundings_are_one_line_or_do_not_matter(tmp_path, line, code, words):
+    np.save(tmp_path / "nähe.npy", np.arange(24, dtype=np.uint16).reshape(2, 3, 4))
+    command = ["bash", "-c", line.format(pchem=f"{sys.executable} -m pchem_pipeline")]
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    found = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, encoding="utf-8")
+    (said,) = (found.stdout + found.stderr).splitlines()
+    assert (found.returncode, bool(re.search(words, said))) == (code, True), said
+
+
+def test_figures_are_drawn_into_files_whatever_matplotlib_is_told(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "rubbish")
+    with pytest.raises(SystemExit):
+        app.main(["--version"])
+    assert os.environ["MPLBACKEND"] == "Agg"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")

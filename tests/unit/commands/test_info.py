@@ -22,6 +22,14 @@ def test_formats_effects_and_the_cache_are_listed(monkeypatch):
     assert lines[-1] == "compiled kernels: /somewhere/kernels"
 
 
+def _said(*paths, refused):
+    """Return the lines on files, the last of which is an error."""
+    lines = []
+    with pytest.raises(InputError, match=refused):
+        lines.extend(info.about_files(paths))
+    return lines
+
+
 def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
     (tmp_path / "night").mkdir()
@@ -33,7 +41,7 @@ def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     assert described == f"{tmp_path / 'c.dcimg'}: {words}stamps"
     assert disk.startswith("in a run, frames stay in their files (")
     assert "3 are missing (after frame 29)" in note
-    good, bad, together, _ = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
+    good, bad, together, _ = _said(tmp_path / "a.tif", tmp_path / "b.tif", refused="1 file cannot be used")
     assert "tiff (tifffile), 40 frames of 8 x 9, uint16, bit depth not stated, no exposure time" in good
     assert bad.startswith(f"{tmp_path / 'b.tif'}: ")
     codes = np.unique(FRAMES[[0, 20, 39]])
@@ -46,5 +54,5 @@ def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         list(info.about_files([tmp_path / "none.tif"]))
     tifffile.imwrite(tmp_path / "c.tif", FRAMES[:, :, 1:], photometric="minisblack")
-    *_, together = info.about_files([tmp_path / "b.tif"])
-    assert together.startswith(f"{tmp_path / 'b.tif'}: ")
+    (bad,) = _said(tmp_path / "b.tif", refused="1 file cannot be used")
+    assert bad.startswith(f"{tmp_path / 'b.tif'}: ")

@@ -60,6 +60,14 @@ def test_a_pixel_has_a_new_defect_unless_what_it_is_seen_in_agrees_within_the_er
     assert now.changes_since(first, lambda y, x: np.where(x == 2, 0.0, 1.0)) == (
         DefectChange(0, 2, "", "hot"),
     )
+    # what the data leave open differs by chance, unless the histograms do
+    good = states([1] * 5, [0.1] * 5, [0.2] * 5, [0] * 5)
+    flagged = states([1] * 5, [0.1] * 5, [0.2] * 5, [0, 256, 256, 128, 128])
+    assert flagged.changes_since(good) == ()
+    confirm = np.array([0.0, 0.5, 1e-9, np.nan, 0.0])
+    assert flagged.changes_since(good, lambda y, x: confirm[x]) == (
+        DefectChange(0, 2, "", "flagged"), DefectChange(0, 4, "", "not_fitted")
+    )  # fmt: skip
     assert now.defects() == {"stuck": 1, "saturated": 0, "dead": 0, "hot": 3, "noisy": 2}
 
 

@@ -64,8 +64,8 @@ def test_files_that_are_missing_empty_or_of_one_frame(tmp_path):
     for name, content, words in (
         ("a.tif", b"", "the file is empty"),
         ("b.xyz", b"what is this", "unknown camera format"),
-        ("c.tif", b"II*\0nonsense", "not a valid TIFF"),
-        ("d.fits", b"hello", "not a valid FITS"),
+        ("c.tif", b"II*\0nonsense", "not a valid tiff"),
+        ("d.fits", b"hello", "does not begin as fits files do"),
     ):
         (tmp_path / name).write_bytes(content)
         not_opened(f"{name}: {words}", tmp_path / name)

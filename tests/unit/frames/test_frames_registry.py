@@ -111,6 +111,12 @@ def test_a_plug_in_that_is_broken_is_one_line_and_leaves_others_as_they_are(tmp_
         "'there_is_no'; repair or uninstall that package"
     ]
     frames = open_frames(InputSettings(files=("a.txf",)), tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(TextReader, "recognises", lambda *_: {}["y"])
+        assert {registry.detect_format(path) for _ in range(2)} == {"textframes"}  # by its suffix
+    assert [record.getMessage() for record in caplog.records[1:]] == [
+        f"the reader 'textframes' ({__name__}) failed: KeyError: 'y'; repair or uninstall that package"
+    ]
     monkeypatch.setattr(TextReader, "read_into", lambda *_: {}["x"])
     with pytest.raises(InputError, match=r"a\.txf: not a valid textframes file, .*KeyError: 'x'"):
         frames.read()

@@ -243,7 +243,7 @@ def test_damaged_chunks(tmp_path):
     with pytest.raises(InputError, match=r"a\.zarr: cannot be decoded"):
         reader.read()
     (path / "zarr.json").write_text("{")
-    refused("not a valid zarr store", path)
+    refused("not a valid zarr file", path)
 
 
 @pytest.mark.parametrize("version", [2, 3])

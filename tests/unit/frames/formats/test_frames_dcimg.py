@@ -96,7 +96,8 @@ def test_what_is_refused(tmp_path, version):
     refuse("pixel type 4; record monochrome", lambda content: put(content, first + 4, "<u4", 4))
     refuse("damaged header", lambda content: put(content, first + 24, "<u4", 77))
     refuse("unknown version 0x8; export", lambda content: put(content, 8, "<u4", 8))
-    refuse("truncated, or not DCIMG", lambda content: content[:40])
+    refuse("not a valid dcimg file, or truncated", lambda content: content[:40])
+    refuse(r"a\.dcimg: does not begin as dcimg files do; correct its name", lambda content: b"text" * 999)
     refuse("truncated", lambda content: content[:-9])
     refuse("truncated: 20 frames need", lambda content: content[:3000])
     if version == 7:

@@ -56,14 +56,14 @@ def test_spe_refusals(tmp_path):
     path = tmp_path / "a.spe"
     good = spe_bytes(STACK, version=3.0, numbers=NUMBERS)
     for data, words in (
-        (good[:4000], "truncated, or not SPE"),
+        (good[:4000], "truncated before its footer"),
         (spe_bytes(STACK)[:-1], r"truncated: 5 frames need 5530 bytes, the file has 5529 \(4 complete"),
         (good[:5600], "truncated before its footer"),
-        (good[:-40], "not a valid SPE file, or truncated"),
+        (good[:-40], "not a valid spe file, or truncated"),
         (spe_bytes(STACK, regions=2), "2 regions of interest; record one"),
         (spe_bytes(STACK, regions=3, version=3.0, numbers=NUMBERS), "3 regions of interest"),
         (good[:108] + b"\5\0" + good[110:], "samples of type 5; record whole numbers"),
-        (good.replace(b'"Frame"', b'"Other"'), "not a valid SPE file"),
+        (good.replace(b'"Frame"', b'"Other"'), "not a valid spe file"),
         (good.replace(b"<SpeFormat", b"<!DOCTYPE a><SpeFormat"), "its footer declares entities"),
     ):
         path.write_bytes(data)
@@ -94,7 +94,7 @@ def test_sif_refusals(tmp_path):
     refused("2 tracks or areas", path)
     for kept in (40, 100, 200, 300, len(good) - STACK.size * 4 - 8, len(good) - 1):
         path.write_bytes(good[:kept])
-        refused(r"a\.sif: .*(not a valid SIF file, or )?truncated", path)
+        refused(r"a\.sif: .*(not a valid sif file, or )?truncated", path)
     path.write_bytes(sif_bytes(STACK - 0.5))
     refused("samples such as .*, raw whole numbers are needed", path)
 
@@ -124,9 +124,9 @@ def test_nd2_refusals(tmp_path):
     for data, words in (
         (nd2_bytes(colours, channels=2), "2 channels or colours; export one"),
         (nd2_bytes(SMALL.astype("<f4"), bits=32), "floating-point samples"),
-        (good[:-100], r"not a valid ND2 file, or truncated"),
-        (good[:300], r"not a valid ND2 file, or truncated"),
-        (b"\0\0\0\x0cjP  " + bytes(200), "old kind|not a valid ND2 file"),
+        (good[:-100], r"not a valid nd2 file, or truncated"),
+        (good[:300], r"not a valid nd2 file, or truncated"),
+        (b"\0\0\0\x0cjP  " + bytes(200), "old kind|not a valid nd2 file"),
     ):
         path.write_bytes(data)
         refused(words, path)

@@ -204,7 +204,7 @@ def test_npy_never_opens_a_pickle(tmp_path):
     np.save(tmp_path / "a.npy", np.array([Trap(), Trap()], dtype=object), allow_pickle=True)
     refused("never opened", tmp_path / "a.npy")
     (tmp_path / "b.npy").write_bytes(pickle.dumps(Trap()))
-    refused("not a valid npy file", tmp_path / "b.npy")
+    refused("does not begin as npy files do", tmp_path / "b.npy")
     assert not (tmp_path / "sprung").exists()
 
 
@@ -248,10 +248,11 @@ def test_ser(tmp_path):
     [
         (ser_bytes(STACK, 16, colour=100), r"colour video \(ColorID 100\); record raw"),
         (ser_bytes(STACK, 33), "damaged header"),
-        (ser_bytes(STACK, 16)[:100], "truncated, or not SER"),
+        (b"text" * 999, r"a\.ser: does not begin as ser files do; correct its name"),
+        (ser_bytes(STACK, 16)[:100], "not a valid ser file, or truncated"),
         (ser_bytes(STACK, 16)[:-1], r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 compl"),
     ],
-    ids=range(4),
+    ids=range(5),
 )
 def test_ser_refusals(tmp_path, data, words):
     (tmp_path / "a.ser").write_bytes(data)

@@ -208,3 +208,17 @@ def test_the_bias_of_the_estimates_in_runs_of_unlike_length_is_no_change():
     assert reasons_of_change(found).shifted  # as in runs of one length
     assert not reasons_of_change(found, (500, 2000))
     assert reasons_of_change(compared(*two_captures(3, shift=0.3)), (500, 2000)).shifted
+
+
+def test_pixels_that_are_flagged_in_one_run_only_are_no_change():
+    """Good in the short run are the 40 % of the lowest values: their mean is ``phi(0.25) / 0.4`` off."""
+    rng = np.random.default_rng(7)
+    true = rng.normal(100, 5, SHAPE)
+    one, other = (true + e * rng.standard_normal(SHAPE) for e in (1.0, 0.5))
+    good = one - true < -0.2533  # 40 % of N(0, 1)
+    found = compared((one, np.ones(SHAPE)), (other, np.full(SHAPE, 0.5)), good)
+    assert 0.75 < found.median_z < 0.9659 * 0.8**0.5  # between median and mean
+    assert reasons_of_change(found, (1000, 4000)).shifted
+    assert not reasons_of_change(found, (1000, 4000), (good.mean(), 1.0)).shifted
+    assert not reasons_of_change(compared(*two_captures(2)), kept=(0.4, 0.4)).shifted
+    assert reasons_of_change(compared(*two_captures(3, shift=0.3)), kept=(0.4, 0.4)).shifted

@@ -48,11 +48,13 @@ def test_spreads_are_those_of_the_sensor_not_of_its_errors():
     for row, true in (
         (found["DSNU_1288"], 0.1 * true_maps["bias"][kept].std()),
         (found["non-uniformity of the gain"], 2.0),
+        (found["PRNU_1288 (similar)"], 5.0),  # 90 % with the hot pixels
         (found["K"], np.mean(1 / true_maps["conversion_gain"][kept])),
         (found["sigma_d"], 0.3),
     ):
         assert abs(row.value - true) < 5 * row.standard_error + 0.001 * true, row
         assert 0 < row.standard_error < 0.1 * true
+    assert found["PRNU_1288 (similar)"].definition_here.endswith("; 24 pixels with defects left out")
     # it can fail: with the errors of the pixels in it the spread of the gain is 2.8 %
     gain = maps["conversion_gain"][kept]
     assert 100 * gain.std() / gain.mean() - 2.0 > 5 * found["non-uniformity of the gain"].standard_error
@@ -96,8 +98,8 @@ def test_exposures_at_several_light_levels_determine_linearity_and_prnu():
 def test_what_needs_dark_or_light_is_empty_without(kind):
     maps, status, _ = drawn()
     found = table(maps, status, kind)
-    assert (found["mu_I.mean"].value is not None) == (kind == "dark")
-    assert (found["PRNU_1288 (similar)"].value is not None) == (kind == "light")
+    assert np.isfinite(found["mu_I.mean"].value) == (kind == "dark")
+    assert np.isfinite(found["PRNU_1288 (similar)"].value) == (kind == "light")
     assert found["eta"].cells()[2:4] == ["", ""]
     assert all(len(row.cells()) == len(COLUMNS) for row in found.values())
     assert all(row.definition_here and row.where_it_differs for row in found.values())
