@@ -17,8 +17,8 @@ _SIDE, _FEW_PIXELS = 64, 2048
 MAX_BINS = 1 << 23
 #: Tiles beyond which they grow: each is some 50 files.
 _MANY = 80
-#: Columns beyond which tiles grow in rows: bands of rows over the full width are read and counted at once.
-_WIDE = 2048
+#: Pixels of rows over the full width, which are read and counted at once, up to which tiles grow in rows.
+_MOST_TOGETHER = 1 << 20
 
 
 @dataclass(frozen=True, order=True)
@@ -64,7 +64,7 @@ def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:
     """Return rows and columns of the tiles of a sensor of some shape (y, x).
 
     With ``auto`` they are 64 x 64, and wider, then higher, on larger sensors: a tile is an amount of work and
-    some 50 files, and neither should be small a thousand times.
+    some 50 files, and neither should be small a thousand times; but a row of tiles has to fit into memory.
     """
     if size != "auto":
         return size if isinstance(size, tuple) else (size, size)
@@ -73,10 +73,12 @@ def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:
     while columns < nx and min(rows, ny) * columns < _FEW_PIXELS:
         columns *= 2
     while -(-ny // rows) * -(-nx // columns) > _MANY:
-        if columns < min(nx, _WIDE):
+        if columns < nx:
             columns *= 2
-        else:
+        elif 2 * rows * nx <= _MOST_TOGETHER:
             rows *= 2
+        else:
+            break
     return rows, columns
 
 
