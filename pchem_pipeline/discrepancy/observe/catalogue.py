@@ -14,7 +14,7 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import parse_place
 
-VERSION = 2
+VERSION = 3
 
 #: Families of statistics, in words.
 FAMILIES = {
@@ -149,6 +149,8 @@ both    space.row.{c}.variance map=x.{p} series=row.{c} row means of the {of} sc
         independent pixels
 both    space.row.{c}.lag1 map=x.{p} series=row.{c} row means of the {of} are [correlated|anticorrelated]
         with the adjacent row
+both    space.row.{c}.halves map=x.{p} series=row.{c} means of both halves of a row of the {of} are
+        [correlated|anticorrelated]
 both    space.column.{c}.variance map=y.{p} series=column.{c} column means of the {of} scatter [more|less]
         than independent pixels
 both    space.column.{c}.lag1 map=y.{p} series=column.{c} column means of the {of} are

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import special
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
@@ -288,30 +288,55 @@ def line_statistics(view: FrameView) -> dict[str, float]:
         variance, mode = view.variance.sum(axis), view.mode.sum(axis)
         for name, *each in zip(OF_LINES, sums, variance, mode, strict=True):
             found |= named(f"space.{line}.{name}", _line_forms(view, *each, waves=name == "readout"))
-    return found
+    return found | {f"space.row.{name}.halves": _halves(view, c) for c, name in enumerate(CHANNELS)}
 
 
 def _line_forms(
     view: FrameView, values: FloatArray, variance: FloatArray, mode: FloatArray, *, waves: bool = False
 ) -> dict[str, float]:
     """Return the statistics of sums over lines (n, lines), the common mode of each frame removed."""
-    some = variance > 0
-    m = int(some.sum())
+    m = int(np.count_nonzero(variance))
     if m < 2:
         return {}
-    scale = np.sqrt(variance[some])
-    pattern = mode[some] / scale
-    rest = np.zeros(values.shape)
-    rest[:, some] = without_mode(values[:, some] / scale, pattern)
+    rest, unit = _without_common_mode(values, variance, mode)
     found = {"variance": float(laws.chi_square(np.sum(rest**2), view.n * (m - 1.0)))}
-    adjacent = np.flatnonzero(some[:-1] & some[1:])
+    adjacent = np.flatnonzero((variance[:-1] > 0) & (variance[1:] > 0))
     if adjacent.size and m > 2:
-        weights = np.zeros(some.size)
-        weights[some] = pattern / np.sqrt(pattern @ pattern)
-        shared = float(weights[adjacent] @ weights[adjacent + 1])
-        products = float(np.sum(rest[:, adjacent] * rest[:, adjacent + 1]))
-        found["lag1"] = (products + view.n * shared) / np.sqrt(view.n * adjacent.size)
+        found["lag1"] = _pair_products(rest, unit, adjacent, adjacent + 1)
     return {**found, "line": _line_over_lines(view, rest, m)} if waves else found
+
+
+def _without_common_mode(
+    values: FloatArray, variance: FloatArray, mode: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return sums (n, lines) of variance 1, 0 of lines without one, less their part along the mode, and that.
+
+    The mode is a unit vector, shape (lines,).
+    """
+    scale = np.sqrt(np.where(variance > 0, variance, np.inf))
+    pattern = mode / scale
+    return without_mode(values / scale, pattern), pattern / np.sqrt(pattern @ pattern)
+
+
+def _pair_products(rest: FloatArray, unit: FloatArray, one: IntArray, two: IntArray) -> float:
+    """Return the statistic of the products of pairs of such lines: what removing the mode makes is known."""
+    n, shared = len(rest), float(unit[one] @ unit[two])
+    return float((np.sum(rest[:, one] * rest[:, two]) + n * shared) / np.sqrt(n * one.size))
+
+
+def _halves(view: FrameView, channel: int) -> float:
+    """Return the statistic of the products of the sums over the left and the right half of the rows."""
+    middle = view.pixels.usable.shape[1] // 2
+    variance, mode = (
+        np.concatenate([of[channel][:, :middle].sum(axis=1), of[channel][:, middle:].sum(axis=1)])
+        for of in (view.pixels.variance, view.pixels.mode)
+    )
+    rows = len(variance) // 2
+    left = np.flatnonzero((variance[:rows] > 0) & (variance[rows:] > 0))
+    if left.size < 2:
+        return float("nan")
+    rest, unit = _without_common_mode(np.concatenate(view.halves[channel], axis=1), variance, mode)
+    return _pair_products(rest, unit, left, rows + left)
 
 
 def _line_over_lines(view: FrameView, rest: FloatArray, used: int) -> float:

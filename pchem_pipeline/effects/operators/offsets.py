@@ -417,7 +417,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
     factors = Factors("offset", "pixels read one after the other", "new in each frame")
     signature = (
         "space.row.readout.lag1", "space.row.readout.variance", "space.x.rr", "space.y.rr",
-        "frame.readout.quadrants",
+        "space.row.readout.halves",
     )  # fmt: skip
     strength = "noise_dn"
     power = 2.0

@@ -226,6 +226,16 @@ def test_sums_are_those_of_plain_numpy() -> None:
     expected = (product - removed)[pairs] / np.sqrt((vr1[:-1] * vr1[1:])[pairs])
     assert time.neighbours["y.rr"] == pytest.approx(expected.mean(), abs=2e-5)
     assert evidence.z["space.y.rr"] == pytest.approx(expected.sum() * np.sqrt(60 / pairs.sum()), abs=1e-2)
+    # both halves of a row: their sums in their standard deviation, less what the frames share
+    halves = np.concatenate([r[:, :, :3].sum(axis=2), r[:, :, 3:].sum(axis=2)], axis=1)
+    deviation, size = (
+        np.concatenate([of[:, :3].sum(axis=1), of[:, 3:].sum(axis=1)]) for of in (vr * usable, usable)
+    )
+    unit = size / np.sqrt(deviation) / np.sqrt((size**2 / deviation).sum())
+    u = halves / np.sqrt(deviation)
+    u -= (u @ unit)[:, None] * unit
+    products = (u[:, :5] * u[:, 5:]).sum() + 60 * unit[:5] @ unit[5:]
+    assert evidence.z["space.row.readout.halves"] == pytest.approx(products / np.sqrt(60 * 5), abs=1e-2)
     mixed = (r1[:, :, :-1] * k1[:, :, 1:] + k1[:, :, :-1] * r1[:, :, 1:]).mean(axis=0)
     near = usable[:, :-1] & usable[:, 1:]
     root = np.sqrt(vr1[:, :-1] * vk1[:, 1:]) + np.sqrt(vk1[:, :-1] * vr1[:, 1:])
