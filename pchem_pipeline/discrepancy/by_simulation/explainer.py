@@ -31,7 +31,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     PixelLikelihood,
     identifiable_from_histograms,
 )
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, Steps
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
 from pchem_pipeline.discrepancy.effort import Effort
@@ -236,11 +236,11 @@ class FrameExplainer(Explainer[Screened]):
         self.extension = Extension.of(self.work, self.given, *own)
         return self.extension.last
 
-    def _measured(self, refitter: Refitter) -> Callable[[tuple[Hypothesis, ...]], Iterator[Refitted]]:
+    def _measured(self, refitter: Refitter) -> Callable[[tuple[Hypothesis, ...]], Iterator[Steps]]:
         """Return what measures samples beside effects, for which some work is kept."""
         unexplained = Unexplained(self.work, refitter, self.prepared.defects)
 
-        def measured(kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
+        def measured(kept: tuple[Hypothesis, ...]) -> Iterator[Steps]:
             self.work.effort.measure()
             return unexplained.measured(kept)
 

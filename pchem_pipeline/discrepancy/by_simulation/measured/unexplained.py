@@ -26,7 +26,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitter, Steps
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -37,7 +37,6 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 Model = tuple[Effect, ...]
 Measure = Callable[[Part, Model, Model], Measurement | None]
 
-_MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
 
@@ -56,7 +55,7 @@ class Unexplained:
     work: Simulations
     refitter: Refitter
     defects: dict[str, str] = field(default_factory=dict)
-    known: dict[tuple[Hypothesis, ...], list[Refitted]] = field(default_factory=dict)
+    _done: set[tuple[Hypothesis, ...]] = field(default_factory=set, repr=False)
     _stacks: dict[Model | None, tuple[NDArray[np.unsignedinteger], PixelMaps]] = field(
         default_factory=dict, repr=False
     )
@@ -74,43 +73,33 @@ class Unexplained:
         }
         return {tag: form for tag, form in forms.items() if tag not in {e.tag for e in self.refitter.present}}
 
-    def measured(self, kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
-        """Yield effects with what explains most beside them, each at its best fit, until one leaves little.
+    def measured(self, kept: tuple[Hypothesis, ...]) -> Iterator[Steps]:
+        """Yield effects with what explains most beside them, each simulated at the size that was measured.
 
-        The likeliest first; forms that are among the effects are not measured again.
+        The likeliest of each form first; forms that are among the effects are not measured again, and nothing
+        is twice beside the same effects.
 
         Raises:
             EffortSpentError: the work is at its limit.
         """
-        if kept in self.known:
-            yield from self.known[kept]
+        if kept in self._done:
             return
-        known = self.known[kept] = []
+        self._done.add(kept)
         have = {h.effect.tag for h in kept}
         forms = {tag: form for tag, form in self._forms.items() if tag not in have}
         for likely in self._likeliest(tuple(h.effect for h in kept), forms):
-            one = self._tried(kept, likely)
-            if one is not None:
-                known.append(one)
-                yield one
-                if self.refitter.residual_is_small(one):
-                    return
-
-    def _tried(self, kept: tuple[Hypothesis, ...], likely: _Likely) -> Refitted | None:
-        """Return effects with a form beside them; None where it fails."""
-        try:
-            return self._described(kept, likely.part, self._forms[likely.form])
-        except EffortSpentError:
-            raise
-        # a defect of what is measured must not cost the verdict
-        except Exception as error:
-            self.defects[likely.form] = error_words(error)
-            return None
+            try:
+                yield from self._described(kept, likely.part, self._forms[likely.form])
+            except EffortSpentError:
+                raise
+            # a defect of what is measured must not cost the verdict
+            except Exception as error:
+                self.defects[likely.form] = error_words(error)
 
     def _likeliest(self, effects: Model, forms: Mapping[str, Measure]) -> list[_Likely]:
-        """Return the parts and forms that explain most beside effects, what is everywhere included."""
+        """Return the forms that explain most beside effects, each in its likeliest part or everywhere."""
         model = self.refitter.model(effects)
-        found: list[_Likely] = []
+        found: dict[str, _Likely] = {}
         self.work.effort.ask(self.work.observed.samples)
         for part, form in itertools.product((Part(), *self.work.frames.parts), forms):
             try:
@@ -119,32 +108,26 @@ class Unexplained:
             except Exception as error:
                 self.defects[form] = error_words(error)
                 continue
-            if one is not None:
-                found.append(_Likely(part, form, one))
-        return sorted(found, key=lambda one: -one.measured.gain)[:_MOST_TRIED]
+            if one is not None and (form not in found or one.gain > found[form].measured.gain):
+                found[form] = _Likely(part, form, one)
+        return sorted(found.values(), key=lambda one: -one.measured.gain)
 
-    def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Refitted | None:
-        """Return effects with what is measured in a part beside them at their best fit, or None."""
+    def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Iterator[Steps]:
+        """Yield effects with what is measured in a part beside them, the likeliest first."""
         refitter, effects = self.refitter, tuple(h.effect for h in kept)
         measured: tuple[Effect, ...] = ()
         for _ in range(_MEASUREMENTS):
             seen = measure(part, refitter.model((*effects, *measured[:1])), refitter.model(effects))
             if seen is None:
-                return None
+                return
             # what is measured has its places in the window; those of parts are on the sensor
             on_sensor = (self.work.frames.on_sensor(e) for e in (seen.effect, *seen.others))
             measured = tuple(e.at_place(part.region, part.when) for e in on_sensor)
-        best: Refitted | None = None
         for effect in measured:
             refitter.allow(effect.tag)
             vectors = refitter.draw((*effects, effect), FEW)
             shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
-            found = refitter.refined((*kept, Hypothesis(effect, shift)))
-            if best is None or found.score > best.score:
-                best = found
-            if refitter.residual_is_small(best):
-                break
-        return best
+            yield refitter.begin((*kept, Hypothesis(effect, shift)))
 
     def _mixture_shifts(self, part: Part, present: Model, beside: Model) -> Measurement | None:
         """Measure the mixture shifts of a part beside effects, with the pixels refitted with those there."""

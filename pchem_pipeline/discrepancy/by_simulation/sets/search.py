@@ -150,15 +150,19 @@ class Search:
         """Simulate sets, the most promising one a step further each time, then simplify and tune the best."""
         for members in sets:
             self.add(members)
-        while self.limit is None and (left := [trial for trial in self.trials if self._is_open(trial)]):
-            # what is expensive comes last: it may be beaten by then
-            next_one = max(left, key=lambda trial: (not is_expensive(trial.effects), trial.promise))
-            self.advance(next((each for each in left if next_one.begins_with(each)), next_one))
+        self._advance_most_promising(self.trials)
         self.eliminate()
         before = self.best
         self.tune()
         if self.best is not before:
             self.eliminate()
+
+    def _advance_most_promising(self, trials: Sequence[Trial]) -> None:
+        """Simulate the most promising of some trials a step further, as long as one may become the best."""
+        while self.limit is None and (left := [trial for trial in trials if self._is_open(trial)]):
+            # what is expensive comes last: it may be beaten by then
+            next_one = max(left, key=lambda trial: (not is_expensive(trial.effects), trial.promise))
+            self.advance(next((each for each in left if next_one.begins_with(each)), next_one))
 
     def advance(self, trial: Trial) -> None:
         """Simulate a trial a step further."""
@@ -205,23 +209,28 @@ class Search:
                 trial.way = again.way
         return self.settle(trial, least)
 
-    def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
+    def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Steps]]) -> None:
         """Measure what is left without effects, then beside the best set, as far as the limit allows.
 
         Unless that leaves nothing at no higher price than one measured part beside the same effects.
         """
         kept = () if self.best is None else self.best.hypotheses
+        before, self.limit = self.limit, None
         for beside in dict.fromkeys(((), kept)):
             best = self.best
             if best is not None and self.complete and best.price <= PRICE_OF_MORE * (len(beside) + 1):
-                return
+                break
+            new: list[Trial] = []
             try:
-                for one in measured(beside):
-                    self.trials += [] if one in self.tried else [Trial.of(one)]
-                    if best is not None and one.score < best.score - FAR:
-                        break  # those that promise less come next
+                for way in measured(beside):
+                    new.append(Trial(way.best.hypotheses, way.best.score, way))
+                    self.trials.append(new[-1])
+                    if self.complete:
+                        break
             except EffortSpentError as spent:
-                self.limit = self.limit or spent
+                self.limit = spent
+            self._advance_most_promising(new)
+        self.limit = before or self.limit
 
     def tune(self) -> None:
         """Tune the parameters of the best set where it leaves something, then of those as good until then."""
@@ -343,7 +352,7 @@ def compare(
     hypotheses: Sequence[Hypothesis],
     sets: Sequence[SetFit],
     beside: Callable[[Refitted], Sequence[SetFit]] = lambda _: (),
-    measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
+    measured: Callable[[tuple[Hypothesis, ...]], Iterable[Steps]] = lambda _: (),
     rounds: int = 3,
 ) -> None:
     """Try effects and sets, then with one effect more or fewer, as long as the best one becomes better.
@@ -353,7 +362,7 @@ def compare(
         hypotheses: all, the likeliest first.
         sets: of them, the likeliest by their fingerprints first.
         beside: returns the likeliest sets of new hypotheses beside a refitted set.
-        measured: measures what effects leave, and yields them with it at their best fit.
+        measured: measures what effects leave, and yields them with it, simulated at the measured size.
         rounds: of sets, at most.
     """
     beside = functools.cache(beside)

@@ -25,18 +25,13 @@ from pchem_pipeline.effects.operators.replace import Empirical
 TAP = Part(Region(columns=((8, 16),)))
 
 
-def unexplained_beside(work: Any = None, *, small: bool = True) -> Unexplained:
-    """Return what measures frames, with fits that say the same of every set."""
-    fit: Any = SimpleNamespace(
-        present=(),
-        passes_goodness_of_fit=lambda _: True,
-        residual_is_small=lambda _: small,
-        model=lambda effects: effects,
-    )
+def unexplained_beside(work: Any = None) -> Unexplained:
+    """Return what measures frames beside no effects."""
+    fit: Any = SimpleNamespace(present=(), model=lambda effects: effects)
     return Unexplained(work, fit)
 
 
-def test_the_form_and_part_that_explain_most_come_first() -> None:
+def test_each_form_comes_in_its_likeliest_part_and_the_likeliest_form_first() -> None:
     of = partial(Measurement, Empirical.typical()[0])
 
     def broken(*_: Any) -> Measurement:
@@ -52,7 +47,7 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
         "broken": broken,
     }
     found = [(one.part, one.form) for one in unexplained._likeliest((), forms)]
-    assert found == [(TAP, "noise"), (Part(), "moves"), (Part(), "noise")]
+    assert found == [(TAP, "noise"), (Part(), "moves")]
     assert "no such line" in unexplained.defects["broken"]
     counted.ask(1300)
     assert effort.spent == counted.spent > 0.0
@@ -88,21 +83,25 @@ def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(monkeypatch: pyt
     assert unexplained._noise(Part(), (), ()) is None
 
 
-@pytest.mark.parametrize(("little", "measured"), [(True, ["any"]), (False, ["any", "other"])])
-def test_what_is_measured_is_yielded_until_one_leaves_little_and_measured_once(
-    little: bool, measured: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    unexplained = unexplained_beside(small=little)
+def test_all_forms_are_yielded_and_measured_once_whatever_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    unexplained = unexplained_beside()
     one = Measurement(Empirical.typical()[0], 9.0)
     likely = [_Likely(Part(), form, one) for form in ("any", "fails", "other")]
     asked: list[Any] = []
-    unexplained.__dict__["_forms"] = {"any": None, "empirical": None}
+
+    def described(_: Any, __: Any, form: str) -> list[str]:
+        if form == "fails":
+            raise ValueError("no such line")
+        return [form, f"or {form}"]
+
+    unexplained.__dict__["_forms"] = {form: form for form in ("any", "fails", "other", "empirical")}
     monkeypatch.setattr(unexplained, "_likeliest", lambda _, forms: asked.append([*forms]) or likely)
-    monkeypatch.setattr(unexplained, "_tried", lambda _, each: None if each.form == "fails" else each.form)
+    monkeypatch.setattr(unexplained, "_described", described)
     kept = (Hypothesis(one.effect, np.zeros(1)),)
-    for _ in range(2):
-        assert list(unexplained.measured(kept)) == measured
-    assert asked == [["any"]]  # the form that is among the effects is not measured again
+    assert [*unexplained.measured(kept)] == ["any", "or any", "other", "or other"]
+    assert unexplained.defects == {"fails": "ValueError: no such line"}
+    assert [*unexplained.measured(kept)] == []
+    assert asked == [["any", "fails", "other"]]  # the form that is among the effects is not measured again
 
 
 @pytest.mark.parametrize(

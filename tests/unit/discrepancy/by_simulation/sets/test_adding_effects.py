@@ -22,7 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Steps
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, _apart
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, Trial, _grown, compare
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
@@ -387,10 +387,10 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
     assert whole.price == PRICE_OF_MORE
     whole = replace(whole, score=best.score - 10.0, rest=best.rest + left)
     world = world_of(**dict.fromkeys(tags, 0.3))
-    found = world.compare(*guesses, measured=lambda kept: [] if kept else [whole])
+    found = world.compare(*guesses, measured=lambda kept: [] if kept else [Steps.begin(whole)])
     assert (found.chosen is whole) == (left == 0.0)
 
-    def never(_: Any) -> list[Refitted]:
+    def never(_: Any) -> list[Steps]:
         raise AssertionError("two effects leave nothing")
 
     for some in (tags[:1], tags[:2]):
