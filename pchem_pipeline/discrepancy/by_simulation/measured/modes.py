@@ -171,7 +171,7 @@ def measured_mode(
 ) -> Measurement | None:
     """Return the change of gain, light or noise beyond that of frames simulated with a model, if clear.
 
-    ``inside``, (y, x), are the pixels of the sums. None also where a steady offset is clearer.
+    ``inside``, (y, x), are the pixels of the sums.
     """
     found = [_Change.of(key, sums, model[key]) for key, sums in data.items()]
     found.sort(key=lambda one: -one.gain)
@@ -186,7 +186,7 @@ def measured_mode(
     ]
     # of an offset that all lines have the covariance tells more
     told = [e for e in effects if e.modes[0].changes != "offset" or e.modes[0].burst is not None]
-    return Measurement(told[0], best.gain, tuple(told[1:])) if told and told[0] is effects[0] else None
+    return Measurement(told[0], best.gain, tuple(told[1:])) if told else None
 
 
 class _Change(NamedTuple):

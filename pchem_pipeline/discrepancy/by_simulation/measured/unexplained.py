@@ -142,18 +142,18 @@ class Unexplained:
     def _noise(self, part: Part, _: Model, beside: Model) -> Measurement | None:
         """Measure what samples of a part share beyond what effects make of them."""
         data, model = self._of(part, None), self._of(part, beside)
-        found = (
+        own = data.evidence, data.inside
+        wave = measured_wave(data.of(running_waves), model.of(running_waves), *own)
+        found = [
+            wave,
             measured_mode(data.of(common_scores), model.of(common_scores), data.maps, data.inside),
-            measured_noise(
-                data.of(residual_covariances), model.of(residual_covariances), data.evidence, data.inside
-            ),
-        )
-        best = max(filter(None, found), key=lambda one: one.gain, default=None)
-        wave = measured_wave(data.of(running_waves), model.of(running_waves), data.evidence, data.inside)
-        if wave is None or best is None:
-            return wave or best
+            measured_noise(data.of(residual_covariances), model.of(residual_covariances), *own),
+        ]
         # a wave is in the covariances of all distances, each of which counts by itself
-        return Measurement(wave.effect, max(wave.gain, best.gain), (best.effect, *best.others))
+        seen = sorted(filter(None, found), key=lambda one: (one is not wave, -one.gain))
+        effects = [effect for one in seen for effect in (one.effect, *one.others)]
+        best = max((one.gain for one in seen), default=0.0)
+        return Measurement(effects[0], best, tuple(effects[1:])) if effects else None
 
     def _electrons(self, part: Part, _: Model, beside: Model) -> Measurement | None:
         """Measure what electrons of a part do to each other beyond what effects make of them."""
