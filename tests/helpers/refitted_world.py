@@ -1,5 +1,6 @@
 """A world of 24 statistics: refitted models that can be drawn from, without a sensor."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,9 +13,10 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, Steps
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
-from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, Trial, compare
+from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.framework.effect import Effect
@@ -22,6 +24,20 @@ from pchem_pipeline.effects.framework.effect import Effect
 NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
 M = len(NAMES)
 Mean = Callable[[Sequence[Effect]], np.ndarray[Any, Any]]
+
+
+def refined(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> Refitted:
+    """Return a set at the strengths that explain the data best, or as near as the work allows."""
+    way = refitter.begin(hypotheses)
+    with contextlib.suppress(EffortSpentError):
+        while refitter.step(way):
+            pass
+    return way.best
+
+
+def at_best_fit(one: Refitted) -> Trial:
+    """Return the trial of a set whose steps have ended."""
+    return Trial(one.hypotheses, one.score, Steps.begin(one), ended=True)
 
 
 class World:

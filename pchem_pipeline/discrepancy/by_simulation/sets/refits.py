@@ -8,7 +8,6 @@ Renault 1993, by secants): an effect is judged by what is left after its best fi
 
 from __future__ import annotations
 
-import contextlib
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import Covariance, NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
@@ -49,7 +47,6 @@ _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
 _STRONG = 10.0  # standard deviations by which an effect moves a statistic where its slope is
 _LARGEST_SHARE = 0.9  # of a factor that a correction takes away
 _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
-_LITTLE = 0.03  # of what there is to explain, nats, that the details of effects may leave
 #: Most that the logarithm of the factor of a strength changes in one step.
 LARGEST_STEP = float(np.log(4.0))
 _FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
@@ -253,18 +250,6 @@ class Refitter:
             now = None  # a step too far
         return way.taken(step, now)
 
-    def refined(self, hypotheses: Sequence[Hypothesis]) -> Refitted:
-        """Return a set at the strengths that explain the data best, or as near as the work allows.
-
-        Raises:
-            NotFittedError, EffortSpentError: see `begin`.
-        """
-        way = self.begin(hypotheses)
-        with contextlib.suppress(EffortSpentError):  # what was simulated is not lost
-            while self.step(way):
-                pass
-        return way.best
-
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
         """Return the model with effects."""
         return along_chain(self.present, effects)
@@ -349,11 +334,6 @@ class Refitter:
         if found and self.passes_goodness_of_fit(found[0]):
             found.sort(key=lambda one: one.price if self.passes_goodness_of_fit(one) else np.inf)
         return found
-
-    def residual_is_small(self, one: Refitted) -> bool:
-        """Return whether a set leaves nothing, or so little of what there was that it may be its details."""
-        little = one.chance - one.score < _LITTLE * (one.chance - self.nothing)
-        return little or self.passes_goodness_of_fit(one)
 
     def kept(self, hypotheses: Sequence[Hypothesis]) -> BoolArray:
         """Return which statistics tell strengths: of effects everywhere, not those of conspicuous parts."""

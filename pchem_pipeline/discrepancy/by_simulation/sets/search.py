@@ -76,11 +76,6 @@ class Trial:
     way: Steps | None = None
     ended: bool = False
 
-    @classmethod
-    def of(cls, one: Refitted) -> Trial:
-        """Return a set that is at its best fit already."""
-        return cls(one.hypotheses, one.score, Steps.begin(one), ended=True)
-
     @property
     def effects(self) -> tuple[Effect, ...]:
         """The effects."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.refitted_world import M, World
+from helpers.refitted_world import refined as refined_set
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, standard_errors, tuned
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
@@ -43,7 +44,7 @@ def world_of(*truth: Effect, beside: np.ndarray | float = 0.0) -> World:
 
 
 def refined(world: World, effect: Effect) -> Refitted:
-    return world.refitter().refined([Hypothesis(effect, statistics([effect]))])
+    return refined_set(world.refitter(), [Hypothesis(effect, statistics([effect]))])
 
 
 def test_numbers_are_brought_to_what_the_data_ask_for() -> None:

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from helpers.refitted_world import NAMES, M, Mean, World
+from helpers.refitted_world import NAMES, M, Mean, World, at_best_fit, refined
 from scipy import stats
 
 from pchem_pipeline.discrepancy.build_verdict import Findings
@@ -81,7 +81,7 @@ def world_of(
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
 def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) -> None:
     world = world_of(row_noise=strength)
-    found = world.refitter().refined([hypothesis("row_noise")])
+    found = refined(world.refitter(), [hypothesis("row_noise")])
     assert found.settled
     wanted, [got] = factor(effect("row_noise", strength)), [factor(e) for e in found.effects]
     error = 1.5 * found.stderr[0] / TRUTH["row_noise"][1]  # six replicates scatter too
@@ -103,7 +103,7 @@ def test_a_dip_on_the_way_to_the_best_strength_is_crossed() -> None:
 
     world = world_of(row_noise=0.1, mean=bent)
     start = Hypothesis(effect("row_noise", 0.1 * np.exp(0.5)), bent([effect("row_noise", 0.1)]))
-    found = world.refitter().refined([start])
+    found = refined(world.refitter(), [start])
     assert np.log(factor(found.effects[0]) / best) < dip - 0.15
     assert world.drawn <= 6 * 7
 
@@ -126,7 +126,7 @@ def test_slopes_that_are_too_steep_cost_few_steps(monkeypatch: pytest.MonkeyPatc
     world = world_of(row_noise=0.1, mean=weak)
     monkeypatch.setattr(world, "draw", draw)
     start = Hypothesis(effect("row_noise", 0.1 * np.exp(-0.7)), (np.arange(M) >= M // 2) * 18.0)
-    found = world.refitter().refined([start])
+    found = refined(world.refitter(), [start])
     # of twelve statistics, two splits and six replicates
     assert abs(np.log(factor(found.effects[0]) / best)) < 3.5 * np.sqrt((0.5 + 1.0 / 6.0) / 12.0) / 3.0
     assert world.drawn <= 6 * 6
@@ -143,7 +143,7 @@ def test_the_error_of_a_strong_effect_is_that_of_its_slope(
     for seed in range(12):
         guesses = [effect(tag, 0.103) for tag in tags]
         refitter = world_of(**dict.fromkeys(tags, 0.1), seed=seed).refitter()
-        found = refitter.refined([Hypothesis(guess, statistics([guess])) for guess in guesses])
+        found = refined(refitter, [Hypothesis(guess, statistics([guess])) for guess in guesses])
         found = refitter.sharpened(found, 24)
         # chance, and 3 % that are allowed to the details of an effect
         wanted = np.hypot(np.sqrt(1.0 / 2.0 + 1.0 / 24.0) / (power * 40.0), 0.03)
@@ -164,7 +164,7 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
             names = (NAMES[0], f"{NAMES[0]}@rows=3:8", *NAMES[2:])
             world.null = replace(world.null, names=names)
             guess = hypothesis("row_noise", 0.2)
-            found = world.refitter().refined([replace(guess, effect=guess.effect.at_place(place))])
+            found = refined(world.refitter(), [replace(guess, effect=guess.effect.at_place(place))])
             factors[place is None, chance] = factor(found.effects[0]) * float(np.exp(found.change[0]))
     assert factors[True, 8.0] == pytest.approx(factors[True, 0.0], rel=1e-6)
     assert factors[False, 8.0] > 1.01 * factors[False, 0.0]
@@ -173,7 +173,7 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
 def test_an_expensive_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_expensive", lambda _: True)
     world = world_of(row_noise=2.0)
-    found = world.refitter().refined([hypothesis("row_noise", 0.02)])
+    found = refined(world.refitter(), [hypothesis("row_noise", 0.02)])
     assert world.drawn <= 3 * 6
     assert not found.settled
 
@@ -192,20 +192,20 @@ def limit(paid: int) -> Callable[[str], None]:
 @pytest.mark.parametrize("paid", [1, 2, 3])
 def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
     world = world_of(row_noise=1.2)
-    found = replace(world.refitter(), allow=limit(paid)).refined([hypothesis("row_noise")])
+    found = refined(replace(world.refitter(), allow=limit(paid)), [hypothesis("row_noise")])
     assert world.drawn == 6 * paid
-    whole = world.refitter().refined([hypothesis("row_noise")])
+    whole = refined(world.refitter(), [hypothesis("row_noise")])
     assert (found.effects == (effect("row_noise", 0.1),)) == (paid == 1)
     assert found.score < whole.score
 
 
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
     world = world_of(row_noise=0.5, frame_noise=0.3)
-    known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
+    known = refined(world.refitter(), [hypothesis("row_noise"), hypothesis("frame_noise")])
     drift = hypothesis("exposure_drift")
 
     def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
-        trials = [Trial.of(one) for one in tried]
+        trials = [at_best_fit(one) for one in tried]
         return Search(world.refitter(), HistogramLikelihood(), trials)._started(members)
 
     first, second = begun([hypothesis("row_noise"), drift], known)
@@ -214,10 +214,10 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     found = begun(members, known)
     assert {found[0].effect, found[2].effect} == set(known.effects)
     assert found[1] is drift
-    alone = world.refitter().refined([hypothesis("row_noise")])
+    alone = refined(world.refitter(), [hypothesis("row_noise")])
     assert begun(members[:2], known, alone)[0].effect == alone.effects[0]
     # in a part, the effect is another hypothesis, however well it does alone
-    here = Trial.of(world.refitter().refined([placed(hypothesis("row_noise"), "columns=0:8")]))
+    here = at_best_fit(refined(world.refitter(), [placed(hypothesis("row_noise"), "columns=0:8")]))
     assert begun(members[:2], here.way.best)[0] is members[0]
     whole = Trial(tuple(members[:2]), 0.0)
     assert not whole.begins_with(Trial(here.members, 0.0))
@@ -312,12 +312,12 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
 def test_statistics_that_are_all_off_a_little_are_no_good_fit() -> None:
     """Each by less than chance may leave among so many, but all of them by more than it does together."""
     world, guess = world_of(row_noise=0.5), [hypothesis("row_noise", 0.5)]
-    fitted = world.refitter().refined(guess)
+    fitted = refined(world.refitter(), guess)
     assert world.refitter().passes_goodness_of_fit(fitted)
     scatter = world.refitter().scatter(fitted.covariance, len(fitted.vectors))
     to_and_fro = np.where(np.arange(M) % 2, 1.0, -1.0)
     off = replace(world.refitter(), target=fitted.mean + 2.55 * scatter * to_and_fro)
-    left = off.refined(guess)
+    left = refined(off, guess)
     assert np.abs(left.rest).max() < 2.0
     assert not off.passes_goodness_of_fit(left)
 
@@ -357,10 +357,10 @@ def test_a_part_of_a_better_set_is_not_grown_again() -> None:
     row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     # of all that there is to explain each explains nearly as much
     far = replace(refitter, null=replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0]))
-    alone, both, other = map(refitter.refined, ([row], [row, frame], [row, drift]))
+    alone, both, other = (refined(refitter, each) for each in ([row], [row, frame], [row, drift]))
     for tried, seeds in (((alone, both), [both.tags]), ((other, both), [other.tags, both.tags])):
         asked: list[frozenset[str]] = []
-        search = Search(far, HistogramLikelihood(), [Trial.of(one) for one in tried])
+        search = Search(far, HistogramLikelihood(), [at_best_fit(one) for one in tried])
         _grown(search, lambda one, asked=asked: asked.append(one.tags) or [])  # type: ignore[misc]
         assert sorted(asked, key=sorted) == sorted(seeds, key=sorted)
 
@@ -401,7 +401,7 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
 def test_a_measured_form_that_leaves_nothing_keeps_no_named_effect_from_its_refit() -> None:
     """Noise in a few rows was not refitted, since a description of two parts had left nothing before."""
     refitter = world_of(row_noise=0.3, frame_noise=0.05).refitter()
-    named = refitter.refined([hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)])
+    named = refined(refitter, [hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)])
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     described = replace(named, hypotheses=(Hypothesis(noise, named.parts.sum(axis=0)),))
     # INL through measured knots had taken the place of noise that grows with the charge
@@ -411,7 +411,7 @@ def test_a_measured_form_that_leaves_nothing_keeps_no_named_effect_from_its_refi
     # as near as row noise by its fingerprint, which leaves what frame noise does
     other = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
     for first, refits in ((described, 1), (curve, 1), (named, 0)):
-        search = Search(refitter, HistogramLikelihood(), [Trial.of(first)])
+        search = Search(refitter, HistogramLikelihood(), [at_best_fit(first)])
         assert search.complete
         search.compare([[other]])
         assert sum(one.tags == {"exposure_drift"} for one in search.tried) == refits
@@ -753,7 +753,7 @@ def test_strengths_that_no_pixel_can_be_fitted_with_end_no_search(monkeypatch: p
     world = world_of(row_noise=0.1)
     guess = Hypothesis(effect("row_noise", 0.098), statistics([effect("row_noise", 0.098)]))
     refitter = world.refitter()
-    near = refitter.refined([guess])
+    near = refined(refitter, [guess])
     world.unfit = lambda effects: effects != near.effects
     assert refitter._slopes(near) is None
     assert refitter.sharpened(near, 24).effects == near.effects
