@@ -166,8 +166,8 @@ class Run:
         """
         if name in self._groups:
             return self._groups[name]
-        if not self._store.has(name):
-            there = sorted(filter(self._store.has, {each.group for each in VARIABLES.values()}))
+        there = sorted(filter(self._store.has, {each.group for each in VARIABLES.values()}))
+        if name not in there:
             raise StoreError(f"{self.path} has no group {name}; it has {', '.join(there) or 'none yet'}")
         for record in filter(None, map(self._store.records.known, STAGES)):
             for file in record.files:

@@ -194,6 +194,9 @@ def test_all_that_a_run_returns_is_pickled(run):
 def test_what_is_missing_or_damaged_is_said(run, finished, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match=r"has no group truth; it has ensemble, .*maps, "):
         _ = run.truth
+    for name in ("", "maps/bias"):
+        with pytest.raises(StoreError, match="has no group"):
+            run.group(name)
     with pytest.raises(StoreError, match="does not exist"):
         pchem_pipeline.open_run(tmp_path / "none.zarr")
     with pytest.raises(StoreError, match=r"not searched for yet; run: pchem discrepancy .*run\.yaml"):
