@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -42,6 +43,16 @@ class PixelStatistics:
     gain_variance: float  # variance of that sum in one frame
     noise: FloatArray  # variance of r^2, in that of r squared: 2 for Gaussian residuals
     square: FloatArray  # weights of r^2 that measure a common relative change of the noise best
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """Weights of k and r of the pixels whose sums are the frame's common modes by least squares, (2, y, x).
+
+        ``w = (m / v) / sum(m^2 / v)`` of modes m and variances v: few pixels of large noise decide nothing.
+        """
+        scaled = np.where(self.usable, self.mode / np.where(self.usable, self.variance, 1.0), 0.0)
+        norm = (scaled * self.mode).sum(axis=(1, 2), keepdims=True)
+        return np.asarray(scaled / np.maximum(norm, np.finfo(np.float64).tiny))
 
 
 def blocks_of(numbers: IntArray, block_frames: int) -> IntArray:

@@ -271,8 +271,8 @@ def block_statistics(view: FrameView) -> dict[str, float]:
     found: dict[str, float] = {}
     usable = view.pixels.usable
     for channel, name in enumerate(CHANNELS):
-        sums, mode = view.blocks[:, channel], view.pixels.mode[channel]
-        rest = sums - (sums.sum(axis=(1, 2)) / mode.sum())[:, None, None] * mode
+        sums, mode, weights = view.blocks[:, channel], view.pixels.mode[channel], view.pixels.weights[channel]
+        rest = sums - (sums * weights).sum(axis=(1, 2))[:, None, None] * mode
         lengths = np.diff(view.edges)[:, None]
         u = rest[:, usable] / np.sqrt(lengths * view.remaining[channel][usable])
         chi2 = np.sum(u**2, axis=0)

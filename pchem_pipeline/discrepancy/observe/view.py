@@ -89,7 +89,7 @@ class FrameView:
         noise, columns = np.zeros((n, ny)), np.zeros((3, n, nx))
         blocks = np.zeros((edges.size - 1, 2, ny, nx))
         products = {name: np.zeros(ny * nx) for name in PRODUCTS}
-        modes = pixels.mode.astype(np.float32)
+        modes, shares = pixels.mode.astype(np.float32), pixels.weights.astype(np.float32)
         weights = np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32)
         for block, (at, end) in zip(blocks, pairwise(edges.tolist()), strict=True):
             before = np.zeros((2, 0, ny, nx), np.float32)
@@ -100,8 +100,7 @@ class FrameView:
                 columns[:2, some] = u.sum(axis=2)
                 columns[2, some] = (weights[2] * u[1] * u[1]).sum(axis=1)
                 block += u.sum(axis=1, dtype=np.float64)
-                common = halves[:, :, some].sum(axis=(1, 3)) / pixels.mode.sum(axis=(1, 2))[:, None]
-                u -= common.astype(np.float32)[:, :, None, None] * modes[:, None]
+                u -= np.einsum("ctyx,cyx->ct", u, shares)[:, :, None, None] * modes[:, None]
                 joined = np.concatenate([before, u], axis=1)
                 _add_products(joined, before.shape[1], products)
                 at, before = some.stop, joined[:, -_LAGS:]
@@ -149,9 +148,8 @@ class FrameView:
     @cached_property
     def remaining(self) -> FloatArray:
         """Variance of k and r after the frame's common mode was removed, 1 in unusable pixels, (2, y, x)."""
-        v, h = self.pixels.variance, self.pixels.mode
-        share = h / h.sum(axis=(1, 2), keepdims=True)
-        left = v * (1.0 - 2.0 * share) + share**2 * v.sum(axis=(1, 2), keepdims=True)
+        v, h, w = self.pixels.variance, self.pixels.mode, self.pixels.weights
+        left = v - h**2 * (w**2 * v).sum(axis=(1, 2), keepdims=True)
         return np.where(self.pixels.usable, np.maximum(left, 1e-3 * np.where(v > 0, v, 1.0)), 1.0)
 
     @cached_property
@@ -184,12 +182,13 @@ class FrameView:
 
     def _shared(self, a: int, b: int, one: _Slices, two: _Slices) -> FloatArray:
         """Return what removing the common modes adds to covariances of channels a and b of two pixels."""
-        # with a' = a - s sum(a) and b' = b - t sum(b), s and t the shares of the pixels in the modes
+        # with a' = a - m sum(w a), m the mode and w its weights, and likewise b'
         pixels = self.pixels
         covariance = (pixels.variance[0], pixels.cross, pixels.variance[1])[a + b]
-        share_a, share_b = (pixels.mode[each] / pixels.mode[each].sum() for each in (a, b))
-        left = share_a[one] * share_b[two] * covariance.sum()
-        return np.asarray(left - share_b[two] * covariance[one] - share_a[one] * covariance[two])
+        (m, w), (other, v) = ((pixels.mode[each], pixels.weights[each]) for each in (a, b))
+        left = m[one] * other[two] * (w * v * covariance).sum()
+        left = left - other[two] * (v * covariance)[one] - m[one] * (w * covariance)[two]
+        return np.asarray(left)
 
     @property
     def freedom(self) -> float:
