@@ -46,7 +46,7 @@ class PixelStatistics:
 
     @cached_property
     def weights(self) -> FloatArray:
-        """Weights of k and r of the pixels whose sums are the frame's common modes by least squares, (2, y, x).
+        """Weights whose sums over k and r are the frame's common modes by least squares, (2, y, x).
 
         ``w = (m / v) / sum(m^2 / v)`` of modes m and variances v: few pixels of large noise decide nothing.
         """
