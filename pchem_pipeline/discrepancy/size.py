@@ -63,9 +63,9 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     if whole and effect.region is not None:
         inside = effect.region.mask(inside.shape)
     changes = [change[:, inside] for change in drawn if change is not None]
-    if not changes:
+    share = float(np.mean([np.mean(np.abs(each) > _CHANGED) for each in changes])) if changes else 0.0
+    if not share:  # alone it changes nothing, as a clamp does whose frames vary by other effects
         return None
-    share = float(np.mean([np.mean(np.abs(change) > _CHANGED) for change in changes]))
     gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))[inside]
     in_dn = effect.plane in (Plane.ADC, Plane.READOUT)
     dn = _spread([change if in_dn else change / gain for change in changes], share)

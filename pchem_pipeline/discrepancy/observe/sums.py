@@ -46,10 +46,7 @@ class PixelStatistics:
 
     @cached_property
     def weights(self) -> FloatArray:
-        """Weights whose sums over k and r are the frame's common modes by least squares, (2, y, x).
-
-        ``w = (m / v) / sum(m^2 / v)`` of modes m and variances v: few pixels of large noise decide nothing.
-        """
+        """Weights ``(m / v) / sum(m^2 / v)`` of modes m: least squares of what a frame shares, (2, y, x)."""
         scaled = np.where(self.usable, self.mode / np.where(self.usable, self.variance, 1.0), 0.0)
         norm = (scaled * self.mode).sum(axis=(1, 2), keepdims=True)
         return np.asarray(scaled / np.maximum(norm, np.finfo(np.float64).tiny))

@@ -186,9 +186,8 @@ class FrameView:
         pixels = self.pixels
         covariance = (pixels.variance[0], pixels.cross, pixels.variance[1])[a + b]
         (m, w), (other, v) = ((pixels.mode[each], pixels.weights[each]) for each in (a, b))
-        left = m[one] * other[two] * (w * v * covariance).sum()
-        left = left - other[two] * (v * covariance)[one] - m[one] * (w * covariance)[two]
-        return np.asarray(left)
+        left = m[one] * other[two] * (w * v * covariance).sum() - m[one] * (w * covariance)[two]
+        return np.asarray(left - other[two] * (v * covariance)[one])
 
     @property
     def freedom(self) -> float:
