@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -170,8 +171,9 @@ def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
 )
 def test_odd_surroundings_are_one_line_or_do_not_matter(tmp_path, line, code, words):
     np.save(tmp_path / "nähe.npy", np.arange(24, dtype=np.uint16).reshape(2, 3, 4))
-    command = ["bash", "-c", line.format(pchem=f"{sys.executable} -m pchem_pipeline")]
+    pchem = f"{shlex.quote(sys.executable)} -m pchem_pipeline"
     paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = ["bash", "-c", line.format(pchem=pchem)]
     found = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, encoding="utf-8")
     (said,) = (found.stdout + found.stderr).splitlines()
     assert (found.returncode, bool(re.search(words, said))) == (code, True), said
