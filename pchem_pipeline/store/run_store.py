@@ -407,7 +407,7 @@ class Part(MutableMapping[str, NDArray[Any]]):
         self._store.delete(self._prefix + name)
 
     def __contains__(self, name: object) -> bool:
-        return self._store.has(f"{self._prefix}{name}")
+        return name != "" and self._store.has(f"{self._prefix}{name}")  # the prefix alone is the group
 
     def __iter__(self) -> Iterator[str]:
         paths = (path for path in VARIABLES if path.startswith(self._prefix) and self._store.has(path))

@@ -309,17 +309,17 @@ def _line_forms(
 def _without_common_mode(
     values: FloatArray, variance: FloatArray, mode: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return sums (n, lines) of variance 1, 0 of lines without one, less their part along the mode, and that.
+    """Return sums over lines, (n, lines), in their standard deviations without the mode, and it, (lines,).
 
-    The mode is a unit vector, shape (lines,).
+    The mode is a unit vector of standardised sums; of lines without variance all is 0.
     """
     scale = np.sqrt(np.where(variance > 0, variance, np.inf))
-    pattern = mode / scale
-    return without_mode(values / scale, pattern), pattern / np.sqrt(pattern @ pattern)
+    unit = mode / scale / np.sqrt((mode**2 / scale**2).sum())
+    return without_mode(values / scale, unit), unit
 
 
 def _pair_products(rest: FloatArray, unit: FloatArray, one: IntArray, two: IntArray) -> float:
-    """Return the statistic of the products of pairs of such lines: what removing the mode makes is known."""
+    """Return the statistic of the products of pairs of lines, standardised and without their unit mode."""
     n, shared = len(rest), float(unit[one] @ unit[two])
     return float((np.sum(rest[:, one] * rest[:, two]) + n * shared) / np.sqrt(n * one.size))
 

@@ -88,7 +88,7 @@ def emva_rows(
     kept = (status & int(FAILED | FLAGGED)) == 0
 
     def of(name: str, pixels: NDArray[Any] = kept) -> FloatArray:
-        values = stored[name][pixels] if name and name in stored else np.empty(0)
+        values = stored[name][pixels] if name in stored else np.empty(0)
         return values if values.size else np.full(1, np.nan)
 
     def prnu(name: str, symbol: str, what: str, differs: str) -> EmvaRow:

@@ -49,11 +49,16 @@ def test_a_measured_noise_has_the_size_that_was_measured(changes: str) -> None:
     assert size.model_dump() == pytest.approx(wanted.model_dump())
 
 
-def test_the_size_in_a_part_is_that_where_it_acts_and_there_is_none_without_usable_pixels() -> None:
+def test_the_size_in_a_part_is_that_where_it_acts_and_there_is_none_of_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
     part = effect.at_place(Region.model_validate({"columns": [[0, 4]]}))
     assert size_of(part, MAPS, 1000) == size_of(effect, MAPS, 1000)
     assert size_of(effect, replace(MAPS, usable=np.zeros(SHAPE, bool)), 1000) is None
+    nothing = f"{size_of.__module__}._change", lambda _, maps, *__: np.zeros((4, *maps.usable.shape))
+    monkeypatch.setattr(*nothing)
+    assert size_of(effect_class("black_clamp").typical()[0], MAPS, 1000) is None
 
 
 def test_a_size_is_told_with_the_samples_that_change() -> None:

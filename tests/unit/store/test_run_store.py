@@ -62,6 +62,7 @@ def test_a_region_of_the_arrays_is_a_mapping(store):
     assert store.at(group="fit")["bias"].shape == (8, 12)
     assert np.nansum(store.read("fit/bias")) == 48.0
     assert np.nansum(store.read("samples/mean")) == 72.0
+    assert "" not in store.at(group="fit")
     [(name, values)] = store.at((slice(0), slice(0)), "fit").items()
     assert (name, values.size) == ("bias", 0)
     with pytest.raises(StoreError, match="has no fit/correlation"):

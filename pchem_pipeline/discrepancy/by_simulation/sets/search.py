@@ -220,7 +220,7 @@ class Search:
                 for way in measured(beside):
                     new.append(Trial(way.best.hypotheses, way.best.score, way))
                     self.trials.append(new[-1])
-                    if self.complete:
+                    if self.refitter.passes_goodness_of_fit(way.best):
                         break
             except EffortSpentError as spent:
                 self.limit = spent

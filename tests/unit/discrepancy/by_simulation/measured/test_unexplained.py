@@ -74,7 +74,7 @@ def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(monkeypatch: pyt
         monkeypatch.setattr(f"{Unexplained.__module__}.measured_{name}", measured)
     for gains["mode"], gains["noise"], best in ((3.0, 9.0, 9.0), (9.0, 3.0, 9.0), (None, 3.0, 3.0)):
         found = unexplained._noise(Part(), (), ())
-        assert found.gain == best
+        assert (found.gain, len(found.others)) == (best, gains["mode"] is not None)
     # a wave is in the covariances of all distances: it is tried first, however many nats these have
     gains["wave"] = 2.0
     found = unexplained._noise(Part(), (), ())

@@ -387,7 +387,10 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
     assert whole.price == PRICE_OF_MORE
     whole = replace(whole, score=best.score - 10.0, rest=best.rest + left)
     world = world_of(**dict.fromkeys(tags, 0.3))
-    found = world.compare(*guesses, measured=lambda kept: [] if kept else [Steps.begin(whole)])
+    # another form whose count of nats was larger, and which fits worse
+    worse = replace(whole, score=best.score - 100.0, rest=best.rest + 9.0)
+    ways = [Steps.begin(one) for one in (worse, whole)]
+    found = world.compare(*guesses, measured=lambda kept: [] if kept else ways)
     assert (found.chosen is whole) == (left == 0.0)
 
     def never(_: Any) -> list[Steps]:
