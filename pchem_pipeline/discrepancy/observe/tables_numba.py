@@ -342,7 +342,10 @@ def compare_pixels(
                 inverse[x] = 1.0 / mass[x]
                 k[x] = exposure + math.sqrt(exposure) * table[1, x] * inverse[x]
             r[x] = value - k[x] * step
-        if not inverse.any():
+        before, beyond = seen.outside[p] > 0.0
+        end = seen.origin[p] + seen.counts.shape[1]
+        # what lies outside of a window that is narrower than the law may be within the law
+        if not inverse.any() or (before and first < seen.origin[p]) or (beyond and first + size > end):
             good[p] = False
             continue
         found = moments[p]

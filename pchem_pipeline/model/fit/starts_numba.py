@@ -58,7 +58,7 @@ _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 N_ATTEMPTS = 2  # the first start, then all steps of the comb; at several samples some starts, then all
 #: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is
 #: larger than the one before by a share of itself, half the width of a narrow peak, or by a third of the
-#: width of a side lobe, 0.16/sd, if that is less; the last is that of H = 200 e-.
+#: width of a side lobe, 0.16/sd, if that is less; the last is that of H = 200 e-, or of few DN per electron.
 _SCAN_SHARE, _SCAN_STEP, _SCAN_END = 0.06, 0.05, 14.4
 _CLEAR = 3.0  # standard errors of the modulus of the ECF, 1 / sqrt(N)
 _UNRESOLVED = 1.1  # ratio of frequencies whose lobes are in the noise
@@ -308,14 +308,14 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 
     ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H
     is: modulus and phase give s and mu, mean and variance H. A step of more than the range of the sample
-    leaves no second peak, one of less than ``sd / 14`` has H > 200 e-; between them the frequencies are
+    leaves no second peak, one of a few DN below ``sd / 14`` has H > 200 e-; between them the frequencies are
     closer than the likelihood's maxima. Past the central lobe few are tried of those that stay in the noise,
     ``3 / sqrt(N)``.
     """
     histogram, work, used = histogram_of(pixel, 0), scratch.rows, 0
     no_starts(scratch.small[HEIGHTS])
     first, sd = work.shape[1] - SCANNED, math.sqrt(histogram.variance)
-    highest = min(_SCAN_END / sd, 1.0 / (LEAST_STEP if cells else MIN_STEP))
+    highest = min(max(_SCAN_END / sd, 1.0 / FEW_STEP), 1.0 / (LEAST_STEP if cells else MIN_STEP))
     end, frequency = first, 1.0 / (histogram.n_bins + 1.0)
     while frequency < highest and end < work.shape[1] - _SIDE_BY_SIDE * SIMD_WIDTH:
         work[0, end], work[1, end] = frequency, 2.0 * math.cos(math.tau * frequency)

@@ -90,7 +90,7 @@ AT, AHEAD, AT_BEST = range(3)
 N_DENSITY_ROWS = 10
 MAX_COMPONENTS = 201  # of which a value may be a mixture
 N_NEGATIVE, _NO_FACTORIAL = 128, 1e5  # numbers below 0 of which a factorial is asked, and its logarithm
-SCANNED = 384  # last columns of `Scratch.rows`, where no evaluation comes: frequencies of a scan
+SCANNED = 768  # last columns of `Scratch.rows`, where no evaluation comes: frequencies of a scan
 _MIN_COLUMNS = 384 + SCANNED  # a value's components
 # rows of `Scratch.cells` of a sample: mass, its inverse, counts over mass, slopes in theta
 MASS, PER_MASS, RATIO, SLOPES = range(4)

@@ -451,3 +451,15 @@ def test_samples_far_above_or_below_are_listed_and_are_the_rarer_ones():
     many = np.zeros((MOST_HITS, 4), np.int64)
     assert len(list(rare_samples(replace(evidence, time=replace(evidence.time, low_hits=many))))) == 2
     assert list(rare_samples(replace(evidence, tail_expected=None))) == []
+
+
+def test_samples_within_the_law_but_outside_of_a_narrow_histogram_are_no_tail() -> None:
+    # the window suits the pixel of 28 e-; of the one of 70 e-, it holds three standard deviations
+    rng = np.random.default_rng(3)
+    frames = PlainCamera(0.25, 2.0, 9.0, (8, 8), 1000).frames(3)
+    electrons = rng.poisson([28.0, 70.0], (1000, 2)) + 0.25 * rng.standard_normal((1000, 2))
+    frames[:, ::4, 4] = np.rint(100.0 + 9.0 * electrons)
+    evidence = seen(frames)
+    assert evidence.maps.usable[0, 4]
+    assert evidence.z["tail.high.count"] < 3
+    assert evidence.z["tail.low.count"] < 3

@@ -102,6 +102,13 @@ def test_of_two_maxima_on_one_comb_the_higher_one_is_kept():
     assert found.conversion_gain[0] == pytest.approx(0.1093, abs=1e-4)
 
 
+def test_the_gain_of_a_pixel_with_hundreds_of_electrons_is_found():
+    # the comb is sharp: the modulus of its lobe, 0.34, is ten standard errors
+    counts, origin = histograms(codes(np.random.default_rng(5), (12, 800), 300.0, 9.2, 0.233))
+    found = fit_histograms(counts, origin)
+    np.testing.assert_allclose(found.conversion_gain, 1.0 / 9.2, rtol=0.005)
+
+
 @pytest.mark.timeout(120)
 def test_steps_out_of_bounds_end_a_climb():
     # a gain that moves from frame to frame, under a law that cannot follow it: all noise is a one-sided tail
