@@ -14,7 +14,7 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import parse_place
 
-VERSION = 3
+VERSION = 4
 
 #: Families of statistics, in words.
 FAMILIES = {
@@ -138,6 +138,8 @@ both    frame.{c}.quadrants map=trend.{c} series=frame.{c} quadrants vary differ
         the {of}
 cross   frame.covariance series=scatter.charge frame means of charge and residual are
         [correlated|anticorrelated]
+cross   frame.follows.line series=scatter.readout frame means of the residuals change with the charge of a row
+        or column
 cross   frame.gain.slow the gain drifts
 cross   frame.gain.trend the gain [rises|falls] along the run
 readout frame.noise.variance series=frame.noise read noise varies [more|less] from frame to frame than

@@ -220,7 +220,22 @@ def frame_statistics(view: FrameView) -> dict[str, float]:
     rho = float(pixels.cross.sum() / np.sqrt(pixels.variance[0].sum() * pixels.variance[1].sum()))
     product = float(series["charge"] @ series["readout"])
     found["frame.covariance"] = (product - view.n * rho) / np.sqrt(view.n * (1.0 + rho**2))
+    of_lines = (view.rows, 1), (view.columns, 0)
+    followed = [_follows(view, series["readout"], sums[:2], axis) for sums, axis in of_lines]
+    found["frame.follows.line"] = laws.largest_normal(np.concatenate(followed))
     return found
+
+
+def _follows(view: FrameView, offsets: FloatArray, sums: FloatArray, axis: int) -> FloatArray:
+    """Return how offsets of frames, (n,), follow the charge of lines that their own residual does not hold.
+
+    ``sums`` are of k and r of the lines, (2, n, m); the products, (m,), have variance 1 by chance.
+    """
+    of_charge, of_readout = view.pixels.variance.sum(axis=axis + 1)
+    held = view.pixels.cross.sum(axis=axis) / np.maximum(of_readout, 1e-300)
+    left = of_charge - held**2 * of_readout
+    followed = offsets @ (sums[0] - held * sums[1])
+    return np.asarray(followed[left > 0.0] / np.sqrt(view.n * left[left > 0.0]))
 
 
 def quadrant_sums(values: FloatArray) -> FloatArray:

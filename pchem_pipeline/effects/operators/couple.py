@@ -321,7 +321,10 @@ class BlackClamp(Effect, tag="black_clamp"):
     title = "frame-dependent black-level clamp"
     source = "Andor iXon manual (baseline clamp); Janesick 2001 (optically black pixels)"
     factors = Factors("offset", "pixels of a frame", "with the charge of the clamp's pixels")
-    signature = ("frame.covariance", "frame.readout.variance", "frame.charge.variance", "space.x.rk")
+    signature = (
+        "frame.covariance", "frame.follows.line", "frame.readout.variance", "frame.charge.variance",
+        "space.x.rk",
+    )  # fmt: skip
     strength = "follow"
     reach_rows = ALL_ROWS  # the clamp may be anywhere
     may_be_at_bound = ("follow",)

@@ -463,3 +463,16 @@ def test_samples_within_the_law_but_outside_of_a_narrow_histogram_are_no_tail() 
     assert evidence.maps.usable[0, 4]
     assert evidence.z["tail.high.count"] < 3
     assert evidence.z["tail.low.count"] < 3
+
+
+def test_offsets_of_frames_that_follow_some_rows_are_told_from_noise() -> None:
+    camera = PlainCamera(0.25, 2.0, 9.0, (24, 24), 1500)
+    frames = camera.frames(4).astype(np.float64)
+    clamp = -0.3 * (frames[:, :4] - frames[:, :4].mean(axis=0)).mean(axis=(1, 2))
+    noise = clamp.std() * np.random.default_rng(4).standard_normal(clamp.size)
+    clamped, noisy = (
+        seen(np.rint(frames + each[:, None, None]).astype(np.uint16)).z for each in (clamp, noise)
+    )
+    for z in (clamped, noisy):
+        assert z["frame.readout.variance"] > 10
+    assert clamped["frame.follows.line"] > 30 > 15 > noisy["frame.follows.line"]
