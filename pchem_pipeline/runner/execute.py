@@ -139,7 +139,6 @@ def _finish(
         return StageState(stage.name, "complete" if done >= record.keys else "partial", "", done, record.keys)
     key, reason = next(iter(context.failed.items()))
     why = f"{len(context.failed)} of {record.keys} units failed, first {key}: {reason}"
-    context.reporter.warning(f"{stage.name}: {why}")
     return StageState(stage.name, "failed", why, done, record.keys)
 
 
