@@ -5,6 +5,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -262,6 +263,14 @@ def test_files_that_would_overwrite_others_are_refused(lab):
     ):
         assert words in refused(lab, "run.zarr", *given, "--output", output, "--format", "fits", "--force")
         assert not (lab.folder / "out").exists()
+
+
+def test_fits_files_that_cannot_be_written_are_refused_before_anything_is_done(lab, monkeypatch):
+    monkeypatch.setitem(sys.modules, "astropy.io.fits", None)
+    said = lab("apply", "run.zarr", "night.tif", "--output", "none", "--format", "fits")
+    assert said.code != 0
+    assert said.stderr.startswith("pchem: FITS files: astropy.io.fits is needed; pip install")
+    assert not [*lab.folder.glob("*none*")]
 
 
 @pytest.mark.filterwarnings("ignore:'datfix'")  # MJD-OBS from DATE-OBS

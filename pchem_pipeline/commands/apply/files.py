@@ -83,7 +83,9 @@ def check_names(frames: FrameSequence, folder: Path) -> None:
 
     Raises:
         InputError: there are such files.
+        MissingDependencyError: FITS files cannot be written here.
     """
+    require("astropy.io.fits", "fits", "FITS files")
     maps = (each.name for each in variables_of("applied") if each.dims not in (*_AXES, _FRAMES))
     seen = dict.fromkeys(maps, "a map")
     for reader, _, _ in _files(frames):
@@ -112,7 +114,6 @@ def _write_fits(
     store: RunStore, folder: Path, made: Sequence[Variable], frames: FrameSequence, content: dict[str, Any]
 ) -> list[Path]:
     """Write a file for each input file, for the exposure, and for each other map."""
-    require("astropy.io.fits", "fits", "FITS files")
     made_of = _provenance(content)
     written: list[Path] = []
 

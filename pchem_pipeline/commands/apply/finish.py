@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.wording import count
 from pchem_pipeline.commands.apply.settings import Job
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.run.progress import Reporter
@@ -67,7 +68,7 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     bad = int((~calibration.usable).sum())
     reporter.info(
         f"apply: {n} frames of {ny} x {nx} pixels"
-        + (f"; {bad} pixels without a calibration are NaN (see quality)" if bad else "")
+        + (f"; {count(bad, 'pixel')} without a calibration: NaN (see quality)" if bad else "")
     )
 
 
