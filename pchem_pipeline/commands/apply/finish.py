@@ -67,7 +67,7 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     _write_quality(output, calibration, raised)
     bad = int((~calibration.usable).sum())
     reporter.info(
-        f"apply: {n} frames of {ny} x {nx} pixels"
+        f"apply: {count(n, 'frame')} of {ny} x {nx} pixels"
         + (f"; {count(bad, 'pixel')} without a calibration: NaN (see quality)" if bad else "")
     )
 
