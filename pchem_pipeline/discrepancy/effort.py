@@ -10,9 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2022: of a simulated stack, and of its samples with all that is looked at; of
-# a code in an evaluation of the likelihood by a plain fit, and in one with effects by components of the law;
-# and of the mass of a code under one component
-_STACK, _SAMPLE, _CODE, _REFIT, _MASS = 0.2, 6.5e-8, 1.0e-8, 1.4e-8, 1.0e-7
+# a code in an evaluation of the likelihood by a plain fit, and in one with effects by components of the law
+_STACK, _SAMPLE, _CODE, _REFIT = 0.2, 6.5e-8, 1.0e-8, 1.4e-8
 # of what is learnt of the sensor from a pixel, and the same by components
 _LEARN, _LEARN_BY = 4.0e-4, 1.0e-4
 MOST_LEARNT_FROM = 1000  # pixels
@@ -84,7 +83,7 @@ class Effort:
 
     def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:
         """Count the masses of so many codes under effects, whose law has so many components."""
-        self.spent += _MASS * masses * components
+        self.spent += _REFIT * masses * (1 + components)
         self.tried |= set(tags)
 
     def check(self, doing: str) -> None:
