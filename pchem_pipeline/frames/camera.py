@@ -94,6 +94,20 @@ class CameraFacts:
         return ", ".join(part for part in parts if part)
 
 
+def unlike(here: CameraFacts, there: CameraFacts, name: str = "the run") -> str:
+    """Return in words how another camera, or another setting of it, took frames; empty: alike or not known.
+
+    Dark and illuminated frames are alike.
+    """
+    if here.serial and there.serial and here.serial != there.serial:
+        return f"serial number {here.serial}, but {name} has {there.serial}"
+    for setting, value in here.setup.items():
+        other = there.setup.get(setting, value)
+        if other != value and setting not in IMAGE_TYPES:
+            return f"{setting} = {value}, but {name} has {other}"
+    return ""
+
+
 class Duration(NamedTuple):
     """An integration time, s (None where its unit is in doubt), and how the file states it."""
 

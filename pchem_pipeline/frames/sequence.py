@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -313,39 +314,39 @@ def _pause(dates: Sequence[tuple[float, str]]) -> str:
 def _check_same_camera(readers: Sequence[FrameReader]) -> None:
     """Refuse files of different cameras or settings: their frames are no samples of one distribution."""
     for name in dict.fromkeys(name for reader in readers for name in reader.camera.setup):
-        values = {
-            each.paths[0].name: each.camera.setup[name] for each in readers if name in each.camera.setup
-        }
-        if len(set(values.values())) > 1:
-            shown = _first_of_each(values, f"{name} = ")
+        values = [reader.camera.setup.get(name) for reader in readers]
+        if len({*values} - {None}) > 1:
+            shown = _first_of_each(readers, values, f"{name} = ")
             raise InputError(
                 f"the files were taken with different settings: {shown}; give those of one setting at a time"
             )
-    serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
-    distinct = set(serials.values())
+    serials = [reader.camera.serial or None for reader in readers]
+    distinct = {*serials} - {None}
     # a number that differs in each of many files counts files
     if len(distinct) > 1 and not 2 < len(readers) == len(distinct):
-        shown = _first_of_each(serials, "serial number ")
+        shown = _first_of_each(readers, serials, "serial number ")
         raise InputError(f"the files are from different cameras: {shown}; give those of one at a time")
 
 
 def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
     """Return a fact that all files state alike; None if a file does not state it."""
-    values = {reader.paths[0].name: getattr(reader, name) for reader in readers}
-    distinct = set(values.values())
+    values = [getattr(reader, name) for reader in readers]
+    distinct = {*values}
     if len(distinct) > 1 and None not in distinct:
-        shown = _first_of_each(values)
+        shown = _first_of_each(readers, values)
         raise InputError(
             f"the files state different {name}: {shown}; set input.{name}, or make one run of each"
         )
     return distinct.pop() if len(distinct) == 1 else None
 
 
-def _first_of_each(values: Mapping[str, Any], what: str = "") -> str:
+def _first_of_each(readers: Sequence[FrameReader], values: Sequence[Any], what: str = "") -> str:
     """Return the first values that differ, each with its files, of many the first and their number."""
     seen: dict[Any, list[str]] = {}
-    for file, value in values.items():
-        seen.setdefault(value, []).append(file)
+    folder = os.path.commonpath([reader.paths[0].parent for reader in readers])
+    for reader, value in zip(readers, values, strict=True):
+        if value is not None:
+            seen.setdefault(value, []).append(os.path.relpath(reader.paths[0], folder))
     return ", ".join(
         f"{what}{value} in {' and '.join(files if len(files) < 5 else (files[0], f'{len(files) - 1} more'))}"
         for value, files in [*seen.items()][:4]

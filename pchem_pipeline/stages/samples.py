@@ -14,7 +14,7 @@ import numpy as np
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.frames.camera import shared_facts
+from pchem_pipeline.frames.camera import shared_facts, unlike
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.input import LISTED_FILES
 from pchem_pipeline.run.sensor import Sample, SensorInfo
@@ -110,16 +110,17 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
     sizes = [f"{each.ny} x {each.nx}" for each in (here, there)]
     regions = [str(each.target.config.input.roi) for each in (mine, first)]
     same_region = "all samples must show the same region of one sensor"
-    same_sensor = "all samples must come from one sensor"
+    same_sensor = "all samples must come from one sensor with the same settings"
     for facts, words, rule in (
         (sizes, "has {} pixels, {} {}", same_region),
-        ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", f"{same_sensor} with the same settings"),
-        ((here.camera.serial, there.camera.serial), "has camera serial number {}, {} {}", same_sensor),
+        ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", same_sensor),
         (regions, "is cropped to {} (input.roi), {} to {}", same_region),
     ):
         if None not in facts and facts[0] != facts[1]:
             found = words.format(facts[0], first.where, facts[1])
             raise ConfigError(f"{mine.where} {found}; {rule}")
+    if found := unlike(here.camera, there.camera, first.where):
+        raise ConfigError(f"{mine.where}: {found}; {same_sensor}")
     for other in others:
         if mine.shares_frames(other):
             raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")

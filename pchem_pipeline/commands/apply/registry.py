@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
-from pchem_pipeline.commands.apply.source import MOST_WARMER, open_gain, unlike, warmer
+from pchem_pipeline.commands.apply.source import MOST_WARMER, open_gain, warmer
+from pchem_pipeline.frames.camera import unlike
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.sensor import SensorInfo

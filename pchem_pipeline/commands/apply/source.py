@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.camera import IMAGE_TYPES, CameraFacts
+from pchem_pipeline.frames.camera import CameraFacts, unlike
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.sequence import FrameSequence
@@ -117,20 +117,6 @@ def limits_of(frames: FrameSequence, sensor: SensorInfo) -> tuple[int, int] | No
     (low, high), (run_low, run_high) = frames.seen_limits, sensor.seen_limits
     depth = frames.bit_depth or sensor.bit_depth
     return replace(sensor, bit_depth=depth, seen_limits=(low or run_low, high or run_high)).adc_limits
-
-
-def unlike(here: CameraFacts, there: CameraFacts) -> str:
-    """Return in words how another camera, or another setting of it, took frames; empty: alike or not known.
-
-    Dark and illuminated frames are alike.
-    """
-    if here.serial and there.serial and here.serial != there.serial:
-        return f"serial number {here.serial}, but the run has {there.serial}"
-    for setting, value in here.setup.items():
-        other = there.setup.get(setting, value)
-        if other != value and setting not in IMAGE_TYPES:
-            return f"{setting} = {value}, but the run has {other}"
-    return ""
 
 
 def open_gain(fit_status: NDArray[np.integer[Any]]) -> str:

@@ -156,6 +156,11 @@ def test_files_of_two_settings_are_no_stack(tmp_path):
     frames = open_frames(InputSettings(files=("0.fits", "1.fits")), tmp_path)
     assert frames.camera.setup == {"GAIN": "0", "READMODE": "fast", "IMAGETYP": "DARK"}
     assert frames.camera.words() == "GAIN 0, READMODE fast, IMAGETYP DARK"
+    for gain in (0, 1):  # files of the same name
+        (tmp_path / f"gain{gain}").mkdir()
+        write_fits(tmp_path / f"gain{gain}/0.fits", STACK[gain], GAIN=gain)
+    with pytest.raises(InputError, match=r"GAIN = 0 in gain0/0\.fits, GAIN = 1 in gain1/0\.fits"):
+        open_frames(InputSettings(files=("gain*/0.fits",)), tmp_path)
 
 
 def test_a_temperature_is_one_of_a_sensor_or_none():

@@ -17,23 +17,30 @@ from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.samples import OpenSample, _same_sensor
 
 
-def sample(name, serial=None, file="one", **settings):
+def sample(name, serial=None, file="one", setup=None, **settings):
     """Return the run of an exposure of a file, which may name a camera."""
     config = RunConfig.model_validate({"input": {"files": ["a.h5"], "bit_depth": 12, **settings}})
     identity = {"files": [{"xxh3_128": file}]}
     sensor = SensorInfo(
         kind="frames", n_frames=9, ny=4, nx=4, dtype="uint16", bit_depth=12, integration_time=None,
-        mode="copy", identity=identity, camera=CameraFacts(serial=serial),
+        mode="copy", identity=identity, camera=CameraFacts(serial=serial, setup=setup or {}),
     )  # fmt: skip
     return OpenSample(name, Target(config, Path(), Path(name)), None, sensor, name)
 
 
 def test_exposures_of_two_cameras_are_refused():
     first = sample("sample a.yaml", "A1", "other")
-    with pytest.raises(ConfigError, match=r"b\.yaml has camera serial number B2, .* A1;"):
+    with pytest.raises(ConfigError, match=r"b\.yaml: serial number B2, but sample a\.yaml has A1;"):
         _same_sensor([first], sample("sample b.yaml", "B2"))
     for serial in ("A1", None):
         _same_sensor([first], sample("sample b.yaml", serial))
+
+
+def test_exposures_of_two_settings_are_refused_and_of_two_image_types_not():
+    first = sample("sample a.yaml", None, "other", {"READMODE": "quiet", "IMAGETYP": "flat"})
+    with pytest.raises(ConfigError, match=r"b\.yaml: READMODE = fast, but sample a\.yaml has quiet;"):
+        _same_sensor([first], sample("sample b.yaml", setup={"READMODE": "fast", "IMAGETYP": "flat"}))
+    _same_sensor([first], sample("sample b.yaml", setup={"READMODE": "quiet", "IMAGETYP": "dark"}))
 
 
 @pytest.mark.parametrize(
