@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -343,10 +342,11 @@ def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
 def _first_of_each(readers: Sequence[FrameReader], values: Sequence[Any], what: str = "") -> str:
     """Return the first values that differ, each with its files, of many the first and their number."""
     seen: dict[Any, list[str]] = {}
-    folder = os.path.commonpath([reader.paths[0].parent for reader in readers])
-    for reader, value in zip(readers, values, strict=True):
+    paths = [reader.paths[0] for reader in readers]
+    alike = len({path.name for path in paths}) < len(paths)
+    for path, value in zip(paths, values, strict=True):
         if value is not None:
-            seen.setdefault(value, []).append(os.path.relpath(reader.paths[0], folder))
+            seen.setdefault(value, []).append(f"{path.parent.name}/{path.name}" if alike else path.name)
     return ", ".join(
         f"{what}{value} in {' and '.join(files if len(files) < 5 else (files[0], f'{len(files) - 1} more'))}"
         for value, files in [*seen.items()][:4]
