@@ -156,11 +156,17 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> FloatAr
 
 def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) -> None:
     """Refuse exposures that do not increase, or too few of them for a line."""
-    x = exposure_axis(settings, _exposures(settings, samples))
+    exposures = _exposures(settings, samples)
+    x = exposure_axis(settings, exposures)
     if x is None:
         return
     what = settings.against.replace("_", " ")
     exposed = np.flatnonzero(np.isfinite(x)).tolist()
+    if settings.against == "integration_time" and len({exposures[i].kind == "dark" for i in exposed}) > 1:
+        raise ConfigError(
+            "input.samples: some are dark and some are not, so H has no slope against time; give the levels "
+            "of the lamp (pchem joint RUNS --level 0,1) or fit without a slope (--against none)"
+        )
     for last, i in itertools.pairwise(exposed):
         if x[i] <= x[last]:
             raise ConfigError(

@@ -226,6 +226,7 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
         (["dark_1s.zarr", "twelve.yaml"], "", "has 12 bits, sample dark_1s.zarr 14"),
         (["dark_1s.zarr", "twin.yaml"], "", "has the same frames as sample dark_1s.zarr"),
         (["timeless.yaml", "dark_2s.zarr"], "", "has no integration time, needed for the charge rate"),
+        (["dark_1s.zarr", "lit.yaml"], "", "some are dark and some are not"),
         (["dark_1s.zarr", "bias.zarr, bias: true"], "", "a slope needs two exposures"),
         (["dark_1s.zarr", "dark_2s.zarr"], "light_level", "give one for each: pchem joint RUNS --level"),
         (["bias.zarr, bias: true"], "", "every sample is a bias"),
@@ -240,6 +241,7 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, agains
         "twelve": f"{frames}, integration_time: 7, bit_depth: 12}}",
         "twin": f"{frames}, integration_time: 7}}",
         "timeless": f"{frames}}}",
+        "lit": f"{frames.replace('1s', '2s')}, integration_time: 9, bit_depth: 14, kind: light}}",
     }
     for name, text in others.items():
         (joint / f"{name}.yaml").write_text(f"run: {{store: {name}.zarr, tile: 8}}\n{text}\n")
