@@ -38,7 +38,6 @@ from pchem_pipeline.model.fit.search_numba import (
     judge,
     loglik_without_gain,
     nats_of_peaks,
-    plus,
     rival_moves_gain,
     score_of,
 )
@@ -142,13 +141,13 @@ def _share_at_limits(pixel: Pixel) -> float:
 
 
 @kernel(borrows=True)
-def _scan_cut(pixel: Pixel, tools: Tools) -> int:
-    """Put the likeliest combs of a cut sample among the starts; return the evaluations.
+def _scan_cut(pixel: Pixel, tools: Tools) -> None:
+    """Put the likeliest combs of a cut sample among the starts.
 
     Of a cut histogram the median stays. So steps from the range of the sample down, exposures, and biases
     around the one that has the median right are all tried.
     """
-    trial, place, used = tools.scratch.small[HERE], 0, 0
+    trial, place = tools.scratch.small[HERE], 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
     no_starts(tools.scratch.small[HEIGHTS])
     while cumulative[place + 1] < 0.5 * facts[N_FRAMES]:
@@ -161,9 +160,8 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> int:
                 trial[0], trial[1 + STEP], trial[1 + SATELLITE] = math.log(exposure), a, 0.0
                 trial[1 + BIAS] = facts[FIRST] + place - a * (middle + around / _STEPS)
                 trial[1 + LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
-                used += keep_start(pixel, tools.evaluate, True, tools.scratch)
+                keep_start(pixel, tools.evaluate, True, tools.scratch)
         a /= _CUT_RATIO
-    return used
 
 
 @kernel(borrows=True)
@@ -171,26 +169,25 @@ def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, fo
     """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
-        used = scan_steps(pixel, tools.evaluate, True, scratch)
+        scan_steps(pixel, tools.evaluate, True, scratch)
     else:
-        _, used = fill_starts(1, False, pixel, tools.basis, tools.evaluate, scratch)
-        used += add_line_starts(pixel, tools.evaluate, True, True, scratch)
-    found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+        fill_starts(1, False, pixel, tools.basis, tools.evaluate, scratch)
+        add_line_starts(pixel, tools.evaluate, True, True, scratch)
+    found = climb_starts(pixel, tools, False, found, best, out)
     return found
 
 
 @kernel(borrows=True)
 def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray) -> Found:
     """Climb from a fit with the density, what the law adds taken off, or else from the fit as it is."""
-    trial, used = tools.scratch.small[HERE], 0
+    trial = tools.scratch.small[HERE]
     for as_it_is in (tools.limits.warm, np.bool_(True)):
         _from_density(pixel, as_it_is, near, trial)
-        outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
-        used += count
+        outcome, loglik = climb_on(pixel, tools, from_start(), trial, trial)
         if outcome == CONVERGED:
             copy(trial, best)
-            return Found(loglik, -math.inf, used, np.bool_(False))
-    return Found(-math.inf, -math.inf, used, np.bool_(False))
+            return Found(loglik, -math.inf, np.bool_(False))
+    return Found(-math.inf, -math.inf, np.bool_(False))
 
 
 @kernel
@@ -223,8 +220,8 @@ def _start_anew(
     n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
     if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
-        used = _scan_cut(pixel, tools)
-        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+        _scan_cut(pixel, tools)
+        found = climb_starts(pixel, tools, False, found, best, out)
     few = not best[place] > FEW_STEP
     astray = few or score > SUSPICIOUS
     rivalled = n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap
@@ -234,13 +231,13 @@ def _start_anew(
     if not (limits.scan and best[place] < ALIASED_STEP):
         return found
     if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
-        used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+        alias_of_step(pixel, tools.evaluate, best, tools.scratch)
+        found = climb_starts(pixel, tools, False, found, best, out)
     elif n == 1:
         for nearer in (1.0, 3.0):
             a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
-            used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
-            found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+            combs_of_step(pixel, tools.evaluate, a, tools.scratch)
+            found = climb_starts(pixel, tools, False, found, best, out)
     return found
 
 
@@ -252,14 +249,14 @@ def _try_satellites(
     n = pixel.facts.shape[0]
     noise = math.exp(0.5 * best[n + LOG_VARIANCE]) / best[n + STEP]
     poor = score_of(out) > _SUSPICIOUS or noise > _UNRESOLVED
-    amplitude, count = search_satellites(
+    amplitude = search_satellites(
         best, found.loglik, pixel, task.law, task.row, task.amplitudes, unsure, poor, tools
     )
     loglik = examine(pixel, tools, best, out)
     if amplitude > 0.0:
         out[DEGREES] = max(out[DEGREES] - 2.0, 0.0)
     out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + SATELLITE]
-    return Found(loglik, found.runner_up, found.used + count + 1, found.degenerate)
+    return Found(loglik, found.runner_up, found.degenerate)
 
 
 def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
@@ -281,24 +278,23 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         best[n + STEP] = 0.0
         tools.scratch.flags[FIXED, n + SATELLITE] = True
         out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
-        found = Found(-math.inf, -math.inf, 0, np.bool_(False))
+        found = Found(-math.inf, -math.inf, np.bool_(False))
         at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
         cut = n == 1 and at_limits
         if known:
             found = _climb_known(pixel, tools, task.near, best)
         if best[n + STEP] > 0.0:
-            loglik, runner_up, used = found.loglik, found.runner_up, found.used
+            loglik, runner_up = found.loglik, found.runner_up
             if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
-                loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
-                used += count
+                loglik, runner_up = climb_neighbours(pixel, tools, best, loglik)
                 if runner_up > -math.inf and (cut or not limits.scan):
                     gap = math.inf  # that of another law, or of a sample that nothing cuts
             examine(pixel, tools, best, out)
             score = score_of(out)
-            found = Found(loglik, runner_up, used + 1, found.degenerate)
+            found = Found(loglik, runner_up, found.degenerate)
         found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
         if not best[n + STEP] > 0.0:
-            return FIT_NOT_CONVERGED, found.used, 0
+            return FIT_NOT_CONVERGED, tools.scratch.used[0], 0
         bias_gap = min(gap, found.loglik - found.runner_up)
         blurred = math.inf
         if n == 1 and not (limits.warm or limits.reshapes):
@@ -306,7 +302,7 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         gap = min(bias_gap, found.loglik - null, blurred)
         if satellites and task.amplitudes.size > 0:
             found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
-        out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
+        out[LOG_LIKELIHOOD], out[GAP], used = found.loglik, gap, tools.scratch.used[0]
         # the density has told whether there is a gain: it knows no other law than one Gaussian does
         above_null = math.inf if known else found.loglik - null
         of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
@@ -317,6 +313,6 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
             unsure = bias_gap < limits.gap
         of_gain = of_gain or (at_limits and unsure)
         word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
-        return word, found.used, int(out[DEGREES])
+        return word, used, int(out[DEGREES])
 
     return search_cells

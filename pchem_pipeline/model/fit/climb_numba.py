@@ -403,7 +403,7 @@ def climb(
     known: FloatArray,
     theta: FloatArray,
     scratch: Scratch,
-) -> tuple[int, float, int]:
+) -> tuple[int, float]:
     """Climb to the maximum near ``theta``, which is updated in place.
 
     The parameters that stay are in the flags `FIXED` of the scratch; the evaluation at the last theta that
@@ -411,9 +411,10 @@ def climb(
 
     Returns:
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
-        that is trusted), number of evaluations.
+        that is trusted).
     """
     outcome, loglik, used, place = ascend(pixel, evaluate, limits, goal, known, theta, scratch)
     if place != AT:
         copy_evaluation(scratch.evaluations[place], scratch.evaluations[AT])
-    return outcome, loglik, used
+    scratch.used[0] += used
+    return outcome, loglik

@@ -91,7 +91,7 @@ def climb_tile(
         loglik[row], regular = -math.inf, False
         if allowed:
             goal = Goal(np.bool_(False), -math.inf, -math.inf, math.inf, tied[row])
-            outcome, height, _ = climb(pixel, evaluate, limits, goal, here, here, scratch)
+            outcome, height = climb(pixel, evaluate, limits, goal, here, here, scratch)
             for i in range(size):
                 allowed = allowed and (here[i] == start[i] or tied[row] or not fixed[row, i])
             if allowed and outcome == CONVERGED:

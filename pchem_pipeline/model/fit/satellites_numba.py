@@ -66,11 +66,11 @@ _LEAST_START, _MOST_START = 0.005, 0.5  # weight of the satellites at a start
 
 
 @kernel(borrows=True)
-def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tuple[float, int]:
-    """Climb with the weight of the satellites free; return log-likelihood, or -inf, and evaluations."""
+def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> float:
+    """Climb with the weight of the satellites free; return log-likelihood, or -inf."""
     goal = Goal(np.bool_(True), to_beat, -math.inf, math.inf, np.bool_(False))
-    outcome, loglik, used = climb_on(pixel, tools, goal, theta, theta)
-    return (loglik if outcome == CONVERGED else -math.inf), used
+    outcome, loglik = climb_on(pixel, tools, goal, theta, theta)
+    return loglik if outcome == CONVERGED else -math.inf
 
 
 @kernel(borrows=True)
@@ -102,6 +102,7 @@ def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, 
     at, fixed = scratch.evaluations[AT], scratch.flags[FIXED]
     theta[last] = 0.0
     without: float = tools.evaluate(pixel, theta, DERIVATIVES, scratch, at)
+    scratch.used[0] += 1
     find_held(theta, at, fixed, limits, scratch.flags[HELD])
     expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
     theta[last] = _LEAST_WEIGHT
@@ -165,11 +166,9 @@ def _with_cumulants(
 
 
 @kernel(borrows=True)
-def _from_cumulants(
-    pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray
-) -> tuple[bool, int]:
-    """Fill ``theta`` with the likeliest comb of a histogram's cumulants; return whether and evaluations."""
-    scratch, histogram, used = tools.scratch, histogram_of(pixel, 0), 0
+def _from_cumulants(pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray) -> bool:
+    """Fill ``theta`` with the likeliest comb of a histogram's cumulants; return whether there is one."""
+    scratch, histogram = tools.scratch, histogram_of(pixel, 0)
     third = m1 = m2 = m3 = 0.0
     for i in range(histogram.n_bins):
         third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
@@ -186,18 +185,18 @@ def _from_cumulants(
     for scale in _SCALES:
         a = scale * third / histogram.variance
         if _with_cumulants(a, third, histogram, (m1, m2, m3), scratch.small[HERE]):
-            used += keep_start(pixel, tools.evaluate, True, scratch)
-    return next_start(scratch, theta), used
+            keep_start(pixel, tools.evaluate, True, scratch)
+    return bool(next_start(scratch, theta))
 
 
 @kernel
 def _refine(
     amplitude: float, theta: FloatArray, highest: float, pixel: Pixel, law: Law, index: int, tools: Tools
-) -> tuple[float, float, int]:
-    """Climb in the amplitude, too; update ``theta``, return amplitude, e-, log-likelihood and evaluations."""
+) -> float:
+    """Climb in the amplitude, too, from a maximum; update ``theta`` and return the amplitude, e-."""
     trial = tools.scratch.small[HERE]
     heights = np.empty(2)
-    used, step, target = 0, _FINER, 0.0
+    step, target = _FINER, 0.0
     for attempt in range(_N_REFINED):
         start = amplitude
         for side in range(3):
@@ -212,8 +211,7 @@ def _refine(
             tried = start * math.exp(target)
             set_peaks(law, index, tried, pixel)
             copy(theta, trial)
-            found, count = _climb(pixel, tools, -math.inf, trial)
-            used += count
+            found = _climb(pixel, tools, -math.inf, trial)
             if side < 2:
                 heights[side] = found
             if found > highest:
@@ -223,7 +221,7 @@ def _refine(
             step *= 0.3
         if attempt > 0 and step < 0.02:
             break
-    return amplitude, highest, used
+    return amplitude
 
 
 @kernel
@@ -237,18 +235,15 @@ def search_satellites(
     unsure: bool,
     thorough: bool,
     tools: Tools,
-) -> tuple[float, int]:
+) -> float:
     """Try free satellites of each amplitude; keep the best in ``theta`` where the likelihood rises by enough.
 
     ``unsure``: a start with one electron more is tried, too; one with one less always is. ``thorough``: both
-    are however unlikely, and starts on other combs.
-
-    Returns:
-        The amplitude kept, e-, 0 without one; evaluations.
+    are however unlikely, and starts on other combs. Return the amplitude kept, e-, 0 without one.
     """
     scratch, weight, best = tools.scratch, theta.size - 1, theta.copy()
     trial, fixed = scratch.small[HERE], scratch.flags[FIXED]
-    kept, highest, used = 0.0, loglik + tools.limits.satellite_rise, 0
+    kept, highest = 0.0, loglik + tools.limits.satellite_rise
     # a satellite above the others is no one's peak of no electron: only an unsure fit may be below
     likely = loglik - CLEAR_GAP if not thorough else -math.inf
     fixed[weight] = False
@@ -256,7 +251,7 @@ def search_satellites(
         set_peaks(law, index, amplitude, pixel)
         for attempt in range(_N_ATTEMPTS):
             copy(theta, trial)
-            usable, count = False, 1
+            usable = False
             if attempt == 0:
                 usable = _from_fit(pixel, tools, trial)
             elif attempt == 1 and (unsure or thorough):
@@ -264,22 +259,18 @@ def search_satellites(
             elif attempt == 2:
                 usable = _beside(-1.0, pixel, tools, trial) > likely
             elif attempt == 3 and thorough and pixel.facts.shape[0] == 1:
-                usable, count = _from_cumulants(pixel, law, amplitude, tools, trial)
-            used += count
+                usable = _from_cumulants(pixel, law, amplitude, tools, trial)
             if not usable:
                 continue
-            found, count = _climb(pixel, tools, -math.inf if attempt == 0 else highest, trial)
-            used += count
+            found = _climb(pixel, tools, -math.inf if attempt == 0 else highest, trial)
             if thorough and found > highest - CLEAR_GAP:
-                found, _, count = climb_neighbours(pixel, tools, trial, found)
-                used += count
+                found, _ = climb_neighbours(pixel, tools, trial, found)
             if found > highest:
                 kept, highest = amplitude, found
                 copy(trial, best)
     if kept > 0.0:
         copy(best, theta)
-        kept, highest, count = _refine(kept, theta, highest, pixel, law, index, tools)
-        used += count
+        kept = _refine(kept, theta, highest, pixel, law, index, tools)
     fixed[weight] = kept == 0.0
     set_peaks(law, index, kept, pixel)
-    return kept, used
+    return kept

@@ -109,19 +109,16 @@ class Found(NamedTuple):
 
     loglik: float  # log-likelihood of the best maximum, -inf without one
     runner_up: float  # that of the next one
-    used: int  # evaluations
     degenerate: bool | np.bool_  # a climb ran towards one Gaussian
 
 
 @kernel(borrows=True)
 def climb_on(
     pixel: Pixel, tools: Tools, goal: Goal, known: FloatArray, theta: FloatArray
-) -> tuple[int, float, int]:
+) -> tuple[int, float]:
     """Climb, see :func:`.climb_numba.climb`."""
-    outcome, loglik, used = tools.climb(
-        pixel, tools.evaluate, tools.limits, goal, known, theta, tools.scratch
-    )
-    return outcome, loglik, used
+    outcome, loglik = tools.climb(pixel, tools.evaluate, tools.limits, goal, known, theta, tools.scratch)
+    return outcome, loglik
 
 
 @kernel(borrows=True)
@@ -198,23 +195,19 @@ def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> 
 
 
 @kernel(borrows=True)
-def climb_neighbours(
-    pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: float
-) -> tuple[float, float, int]:
+def climb_neighbours(pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: float) -> tuple[float, float]:
     """Move ``best`` to a neighbour while one is more likely.
 
-    Returns:
-        Log-likelihood of the best, that of the best other one (-inf without one), evaluations.
+    Return its log-likelihood, and that of the best other one, -inf without one.
     """
     trial, runner_up = tools.scratch.small[OTHER], -math.inf
-    came_from, used, moves, which = -1, 0, 0, 0
+    came_from, moves, which = -1, 0, 0
     while which < _count_neighbours(pixel, tools.limits.cells, best):
         if which == came_from or not _neighbour(which, pixel, best, trial):
             which += 1
             continue
         goal = goal_beside(False, best_loglik, runner_up)
-        outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
-        used += count
+        outcome, loglik = climb_on(pixel, tools, goal, best, trial)
         higher = outcome == CONVERGED and loglik > best_loglik
         if outcome == DEGENERATE or same_place(best, trial, tools.limits.cells):
             if higher:
@@ -231,7 +224,7 @@ def climb_neighbours(
         else:
             runner_up = max(runner_up, loglik)
             which += 1
-    return best_loglik, runner_up, used
+    return best_loglik, runner_up
 
 
 @kernel(borrows=True)
@@ -396,6 +389,7 @@ def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> f
     """Evaluate at a maximum, into `AT_BEST`; fill goodness of fit and outliers; return the log-likelihood."""
     scratch = tools.scratch
     loglik: float = tools.evaluate(pixel, theta, EXPECTATIONS, scratch, scratch.evaluations[AT_BEST])
+    scratch.used[0] += 1
     out[OUTLYING] = outlying(pixel, tools.limits.floor)
     out[CHI2], freedom = goodness(pixel)
     out[DEGREES] = float(freedom)
@@ -469,7 +463,7 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
         return True
     for which in range(2):
         if _neighbour(which, pixel, best, trial):
-            outcome, height, _ = climb_on(pixel, tools, from_start(), best, trial)
+            outcome, height = climb_on(pixel, tools, from_start(), best, trial)
             if outcome == CONVERGED and height > least:
                 highest = max(highest, height)
                 if abs(trial[1 + STEP] - best[1 + STEP]) > _SAME_GAIN * best[1 + STEP]:
@@ -549,20 +543,18 @@ def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -
 @kernel(borrows=True)
 def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray) -> Found:
     """Examine a new best maximum and, unless the fit rules them out, its neighbours; keep the likeliest."""
-    n, loglik, runner_up, used = pixel.facts.shape[0], found.loglik, found.runner_up, found.used + 1
+    n, loglik, runner_up = pixel.facts.shape[0], found.loglik, found.runner_up
     at_best = examine(pixel, tools, best, out)
     if n == 1 and not tools.limits.cells:
         good, _ = settled(pixel, best, clear, math.inf, out)
         expected = expected_gap(pixel.facts[0, N_FRAMES], best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
         if good and out[DEGREES] > 0.0 and expected > sure and best[n + STEP] > _FINE_STEP:
-            return Found(at_best, max(runner_up, at_best - expected), used, found.degenerate)
-    higher, beside, count = climb_neighbours(pixel, tools, best, loglik)
-    used += count
+            return Found(at_best, max(runner_up, at_best - expected), found.degenerate)
+    higher, beside = climb_neighbours(pixel, tools, best, loglik)
     if higher > loglik:
         at_best = examine(pixel, tools, best, out)
-        used += 1
-    return Found(at_best, max(beside, runner_up), used, found.degenerate)
+    return Found(at_best, max(beside, runner_up), found.degenerate)
 
 
 @kernel(borrows=True)
@@ -581,29 +573,22 @@ def _climb_start(
     # of several samples, and of cells, one comb may have two maxima
     if known and n == 1 and not cells:
         goal = goal_beside(True, found.loglik, found.runner_up)
-    outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
-    used = found.used + count
+    outcome, loglik = climb_on(pixel, tools, goal, best, trial)
     if outcome == DEGENERATE:
-        return Found(found.loglik, found.runner_up, used, np.bool_(True))
+        return Found(found.loglik, found.runner_up, np.bool_(True))
     same = known and same_place(best, trial, cells)
     least = found.loglik + _SAME_COMB if same and not cells else found.loglik
     if outcome != CONVERGED or loglik <= least:
         # where a climb did not arrive, a higher value is none of the density's likelihood
         no_rival = same or (outcome != CONVERGED and loglik > found.loglik and not cells)
         runner_up = found.runner_up if no_rival else max(found.runner_up, loglik)
-        return Found(found.loglik, runner_up, used, found.degenerate)
+        return Found(found.loglik, runner_up, found.degenerate)
     runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
     copy(trial, best)
     if same and cells:  # its neighbours are known
-        return Found(examine(pixel, tools, best, out), runner_up, used + 1, found.degenerate)
-    weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, used, found.degenerate), best, out)
+        return Found(examine(pixel, tools, best, out), runner_up, found.degenerate)
+    weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, found.degenerate), best, out)
     return weighed
-
-
-@kernel(borrows=True)
-def plus(found: Found, count: int) -> Found:
-    """Count evaluations."""
-    return Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
 
 
 @kernel(borrows=True)
@@ -620,14 +605,14 @@ def climb_starts(
 @kernel(borrows=True)
 def _stay_near(
     pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
-) -> tuple[bool, float, int]:
-    """Climb from what is known; return whether that fits well, log-likelihood and evaluations."""
+) -> tuple[bool, float]:
+    """Climb from what is known; return whether that fits well, and its log-likelihood."""
     copy(task.near, trial)
-    outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
+    outcome, loglik = climb_on(pixel, tools, from_start(), trial, trial)
     if outcome != CONVERGED:
-        return False, loglik, used
+        return False, loglik
     examine(pixel, tools, trial, out)
-    return score_of(out) < SUSPICIOUS, loglik, used
+    return score_of(out) < SUSPICIOUS, loglik
 
 
 def search_density(
@@ -645,20 +630,19 @@ def search_density(
     Returns:
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
-    n, trial, limits = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits
-    heights = tools.scratch.small[HEIGHTS]
-    null, used = loglik_without_gain(pixel), 0
+    n, trial, limits, used = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits, tools.scratch.used
+    heights, null = tools.scratch.small[HEIGHTS], loglik_without_gain(pixel)
     best[n + STEP] = 0.0
     if task.near[n + STEP] > 0.0:
-        fits, loglik, used = _stay_near(pixel, tools, task, trial, out)
+        fits, loglik = _stay_near(pixel, tools, task, trial, out)
         if fits:
             copy(trial, best)
             out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
             word = judge(pixel, limits, best, loglik - null, math.inf, math.inf, False)
-            return word, used + 1, int(out[DEGREES])
-    found = Found(-math.inf, -math.inf, used, np.bool_(False))
+            return word, used[0], int(out[DEGREES])
+    found = Found(-math.inf, -math.inf, np.bool_(False))
     for attempt in range(N_ATTEMPTS):
-        clear, count = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
+        clear = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
         before = found.loglik
         if clear and attempt == 0:
             most = -math.inf
@@ -666,21 +650,21 @@ def search_density(
                 most = max(most, heights[i])
             for i in range(N_KEPT):
                 heights[i] = heights[i] if heights[i] == most else -math.inf
-        found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
+        found = climb_starts(pixel, tools, clear, found, best, out)
         if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
             poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP
-            count = longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
-            found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
+            longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
+            found = climb_starts(pixel, tools, clear, found, best, out)
         if found.loglik > before and not settled(pixel, best, clear, found.loglik - null, out)[1]:
             break
         if limits.quick and found.loglik - null > limits.gap:
             break
     if not best[n + STEP] > 0.0:
-        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, found.used, 0
-    out[LOG_LIKELIHOOD] = found.loglik
+        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, used[0], 0
+    out[LOG_LIKELIHOOD], count = found.loglik, used[0]
     blurred = above_blurred(pixel, tools, best, found.loglik)
     out[GAP] = min(found.loglik - max(found.runner_up, null), blurred)
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.runner_up)
     gap = found.loglik - found.runner_up
     word = judge(pixel, limits, best, found.loglik - null, blurred, gap, of_gain)
-    return word, found.used, int(out[DEGREES])
+    return word, count, int(out[DEGREES])

@@ -275,7 +275,7 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
                 continue
             if limits.cells:
                 resolve(law, index, 0.0, pixel)
-            near[n + STEP], gap = 0.0, math.inf
+            near[n + STEP], gap, scratch.used[0] = 0.0, math.inf, 0
             if starts.parameters.shape[0] > 0:
                 theta_of(starts.parameters[index], pixel, limits, near)
                 gap = starts.gaps[index]
