@@ -16,37 +16,10 @@ from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, DEGENERATE, Goal, Limits, find_held, same_place
 from pchem_pipeline.model.fit.starts_numba import N_ATTEMPTS, fill_starts, keep_start, longer_steps, no_starts
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.density_numba import LOG_2PI
-from pchem_pipeline.model.law.pixel_numba import (
-    AT,
-    AT_BEST,
-    BIAS,
-    DARK,
-    EXPECTATIONS,
-    EXPECTED,
-    FIRST,
-    FIXED,
-    HEIGHTS,
-    HELD,
-    HERE,
-    KEPT_STARTS,
-    LOG_VARIANCE,
-    LOGLIK_ALONE,
-    MEAN,
-    N_BINS,
-    N_FRAMES,
-    N_KEPT,
-    OCCUPIED,
-    OTHER,
-    SATELLITE,
-    STEP,
-    VARIANCE,
-    WEIGHT,
-    Pixel,
-    Scratch,
-    copy,
-)
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch, copy
 
 NO_DATA, TOO_FEW_BINS = int(FitStatus.NO_DATA), int(FitStatus.TOO_FEW_BINS)
 FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED = int(FitStatus.NOT_CONVERGED), int(FitStatus.GAIN_NOT_IDENTIFIED)
@@ -138,9 +111,9 @@ def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
     """Return the nats that peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring: ``N r^2``."""
     n, frames = pixel.facts.shape[0], 0.0
     for j in range(n):
-        if pixel.facts[j, DARK] == 0.0:
-            frames += pixel.facts[j, N_FRAMES]
-    noise2 = math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
+        if pixel.facts[j, px.DARK] == 0.0:
+            frames += pixel.facts[j, px.N_FRAMES]
+    noise2 = math.exp(best[n + px.LOG_VARIANCE]) / best[n + px.STEP] ** 2
     return frames * math.exp(-4.0 * math.pi**2 * noise2)
 
 
@@ -149,7 +122,7 @@ def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
     """Return the largest exposure of a pixel's samples, e-."""
     most = 0.0
     for j in range(pixel.facts.shape[0]):
-        if pixel.facts[j, DARK] == 0.0:
+        if pixel.facts[j, px.DARK] == 0.0:
             most = max(most, math.exp(theta[j]))
     return most
 
@@ -162,10 +135,10 @@ def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     """
     n = pixel.facts.shape[0]
     if n == 1:
-        return 4 if cells and not theta[n + STEP] > FEW_STEP else 2
-    frames = pixel.facts[0, N_FRAMES]
+        return 4 if cells and not theta[n + px.STEP] > FEW_STEP else 2
+    frames = pixel.facts[0, px.N_FRAMES]
     for j in range(n):
-        frames = min(frames, pixel.facts[j, N_FRAMES])
+        frames = min(frames, pixel.facts[j, px.N_FRAMES])
     reach = 3.0 * math.sqrt(2.0 / frames) * _most_electrons(pixel, theta)
     return 4 + 2 * int(min(reach, _MOST_STEPS))
 
@@ -185,12 +158,12 @@ def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> 
     if which < 2:
         for j in range(n):
             out[j] = math.log(max(math.exp(theta[j]) + change, 0.01))
-        out[n + BIAS] -= change * theta[n + STEP]
+        out[n + px.BIAS] -= change * theta[n + px.STEP]
         return True
     factor = (most + change) / most
     for j in range(n):
         out[j] += math.log(factor)
-    out[n + STEP] /= factor
+    out[n + px.STEP] /= factor
     return bool(most > _LEAST_BRIGHT)
 
 
@@ -200,7 +173,7 @@ def climb_neighbours(pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: 
 
     Return its log-likelihood, and that of the best other one, -inf without one.
     """
-    trial, runner_up = tools.scratch.small[OTHER], -math.inf
+    trial, runner_up = tools.scratch.small[px.OTHER], -math.inf
     came_from, moves, which = -1, 0, 0
     while which < _count_neighbours(pixel, tools.limits.cells, best):
         if which == came_from or not _neighbour(which, pixel, best, trial):
@@ -232,8 +205,8 @@ def loglik_without_gain(pixel: Pixel) -> float:
     """Return the log-likelihood of Gaussians of one width, each at the mean of its sample: g to infinity."""
     n = square = 0.0
     for j in range(pixel.facts.shape[0]):
-        n += pixel.facts[j, N_FRAMES]
-        square += pixel.facts[j, N_FRAMES] * pixel.facts[j, VARIANCE]
+        n += pixel.facts[j, px.N_FRAMES]
+        square += pixel.facts[j, px.N_FRAMES] * pixel.facts[j, px.VARIANCE]
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(square / n, QUANTISATION_VARIANCE)))
 
 
@@ -245,11 +218,11 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
     of ``2 exp(-2 pi^2 0.8^2) = 7e-6``: ``H / (H + 0.8^2)^(3/2)`` is the skewness, or as near to it as that
     read noise lets it.
     """
-    facts, weights, trial = pixel.facts[0], pixel.bins[0, WEIGHT], scratch.small[HERE]
+    facts, weights, trial = pixel.facts[0], pixel.bins[0, px.WEIGHT], scratch.small[px.HERE]
     third = 0.0
-    for i in range(int(facts[N_BINS])):
-        third += weights[i] * (facts[FIRST] + i - facts[MEAN]) ** 3
-    skewness = max(third / facts[N_FRAMES] / facts[VARIANCE] ** 1.5, _LEAST_SKEWNESS)
+    for i in range(int(facts[px.N_BINS])):
+        third += weights[i] * (facts[px.FIRST] + i - facts[px.MEAN]) ** 3
+    skewness = max(third / facts[px.N_FRAMES] / facts[px.VARIANCE] ** 1.5, _LEAST_SKEWNESS)
     low, high = 2.0 * _BLURRED2, 4.0 / skewness**2 + 10.0
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
@@ -257,11 +230,12 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
             low = middle
         else:
             high = middle
-    a = math.sqrt(facts[VARIANCE] / (low + _BLURRED2))
+    a = math.sqrt(facts[px.VARIANCE] / (low + _BLURRED2))
     rounding = QUANTISATION_VARIANCE if cells else 0.0
-    trial[0], trial[1 + STEP], trial[1 + BIAS] = math.log(low), a, facts[MEAN] - low * a
-    trial[1 + LOG_VARIANCE], trial[1 + SATELLITE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01)), 0.0
-    loglik: float = evaluate(pixel, trial, LOGLIK_ALONE, scratch, scratch.evaluations[AT])
+    trial[0], trial[1 + px.STEP], trial[1 + px.BIAS] = math.log(low), a, facts[px.MEAN] - low * a
+    trial[1 + px.LOG_VARIANCE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01))
+    trial[1 + px.SATELLITE] = 0.0
+    loglik: float = evaluate(pixel, trial, px.LOGLIK_ALONE, scratch, scratch.evaluations[px.AT])
     return loglik
 
 
@@ -274,9 +248,9 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     n = pixel.facts.shape[0]
     most = 0.0
     for j in range(n):
-        if pixel.facts[j, DARK] == 0.0:
-            most = max(most, pixel.facts[j, N_FRAMES])
-    noise2 = math.exp(theta[n + LOG_VARIANCE]) / theta[n + STEP] ** 2
+        if pixel.facts[j, px.DARK] == 0.0:
+            most = max(most, pixel.facts[j, px.N_FRAMES])
+    noise2 = math.exp(theta[n + px.LOG_VARIANCE]) / theta[n + px.STEP] ** 2
     return math.sqrt(most) * math.exp(-2.0 * math.pi**2 * noise2)
 
 
@@ -361,11 +335,11 @@ def goodness(pixel: Pixel) -> tuple[float, int]:
     chi2, freedom = 0.0, 1 - FITTED_PARAMETERS
     for j in range(pixel.facts.shape[0]):
         bins, facts = pixel.bins[j], pixel.facts[j]
-        own, degrees = pearson(bins[WEIGHT], bins[EXPECTED], int(facts[N_BINS]), facts[N_FRAMES])
+        own, degrees = pearson(bins[px.WEIGHT], bins[px.EXPECTED], int(facts[px.N_BINS]), facts[px.N_FRAMES])
         if degrees > 0:
             chi2 += own
             freedom += degrees + FITTED_PARAMETERS
-            if facts[DARK] == 0.0:
+            if facts[px.DARK] == 0.0:
                 freedom -= 1
     if freedom <= 0:
         return math.nan, 0
@@ -378,9 +352,9 @@ def outlying(pixel: Pixel, floor: float) -> float:
     found = 0.0
     for j in range(pixel.facts.shape[0]):
         bins = pixel.bins[j]
-        for i in range(int(pixel.facts[j, N_BINS])):
-            if bins[EXPECTED, i] < floor:
-                found += bins[WEIGHT, i]
+        for i in range(int(pixel.facts[j, px.N_BINS])):
+            if bins[px.EXPECTED, i] < floor:
+                found += bins[px.WEIGHT, i]
     return found
 
 
@@ -388,7 +362,7 @@ def outlying(pixel: Pixel, floor: float) -> float:
 def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> float:
     """Evaluate at a maximum, into `AT_BEST`; fill goodness of fit and outliers; return the log-likelihood."""
     scratch = tools.scratch
-    loglik: float = tools.evaluate(pixel, theta, EXPECTATIONS, scratch, scratch.evaluations[AT_BEST])
+    loglik: float = tools.evaluate(pixel, theta, px.EXPECTATIONS, scratch, scratch.evaluations[px.AT_BEST])
     scratch.used[0] += 1
     out[OUTLYING] = outlying(pixel, tools.limits.floor)
     out[CHI2], freedom = goodness(pixel)
@@ -420,10 +394,10 @@ def judge(
     runner-up; ``of_gain``: one that is near has another gain.
     """
     n, status = pixel.facts.shape[0], 0
-    sigma, a = math.exp(0.5 * best[n + LOG_VARIANCE]), best[n + STEP]
+    sigma, a = math.exp(0.5 * best[n + px.LOG_VARIANCE]), best[n + px.STEP]
     at_bound = True
     for j in range(n):
-        at_bound = at_bound and (pixel.facts[j, DARK] > 0.0 or best[j] <= limits.bound + 1e-9)
+        at_bound = at_bound and (pixel.facts[j, px.DARK] > 0.0 or best[j] <= limits.bound + 1e-9)
     if above_null < limits.gap:
         status |= GAIN_NOT_IDENTIFIED
     if gap < limits.gap:
@@ -439,7 +413,7 @@ def judge(
     if n > 1 and limits.cells and sigma < _COARSE_NOISE and 1.0 / a > 0.5 - NEAR_TWO:
         status |= GAIN_AMBIGUOUS  # combs with the same codes are looked for in single samples only
     if n == 1:
-        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES):
+        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, px.OCCUPIED] < _FEWEST_CODES):
             status |= GAIN_AMBIGUOUS
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)
@@ -455,7 +429,7 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     An electron more or fewer hardly moves the gain where peaks are resolved, which then bring many nats by
     themselves. Any other rival has a gain of its own.
     """
-    least, highest, trial = loglik - tools.limits.gap, -math.inf, tools.scratch.small[OTHER]
+    least, highest, trial = loglik - tools.limits.gap, -math.inf, tools.scratch.small[px.OTHER]
     if pixel.facts.shape[0] > 1 or not runner_up > least:
         return False
     blurred = loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
@@ -466,7 +440,7 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
             outcome, height = climb_on(pixel, tools, from_start(), best, trial)
             if outcome == CONVERGED and height > least:
                 highest = max(highest, height)
-                if abs(trial[1 + STEP] - best[1 + STEP]) > _SAME_GAIN * best[1 + STEP]:
+                if abs(trial[1 + px.STEP] - best[1 + px.STEP]) > _SAME_GAIN * best[1 + px.STEP]:
                     return True
     return bool(runner_up > highest + _SAME_RIVAL)
 
@@ -474,14 +448,14 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
 @kernel(borrows=True)
 def next_start(scratch: Scratch, theta: FloatArray) -> bool:
     """Take the highest of the starts; False where none is left."""
-    heights, which = scratch.small[HEIGHTS], 0
-    for i in range(1, N_KEPT):
+    heights, which = scratch.small[px.HEIGHTS], 0
+    for i in range(1, px.N_KEPT):
         if heights[i] > heights[which]:
             which = i
     if heights[which] == -math.inf:
         return False
     heights[which] = -math.inf
-    copy(scratch.small[KEPT_STARTS + which], theta)
+    copy(scratch.small[px.KEPT_STARTS + which], theta)
     return True
 
 
@@ -495,16 +469,21 @@ def fall_and_parabola(
     with the parameter fixed. The fall is infinite where nothing is to be known.
     """
     scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
-    at, held, trial, change = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE], 0.0
-    find_held(best, at, scratch.flags[FIXED], tools.limits, held)
+    at, held, trial, change = (
+        scratch.evaluations[px.AT_BEST],
+        scratch.flags[px.HELD],
+        scratch.small[px.HERE],
+        0.0,
+    )
+    find_held(best, at, scratch.flags[px.FIXED], tools.limits, held)
     if not invert_arrow(at, best, held, covariance):
         return math.inf, 0.0
-    scratch.flags[FIXED, which] = True
+    scratch.flags[px.FIXED, which] = True
     for _ in range(2):
         if next_start(scratch, trial):
             change = trial[which] - best[which]
             top = max(top, climb_on(pixel, tools, from_start(), trial, trial)[1])
-    scratch.flags[FIXED, which] = False
+    scratch.flags[px.FIXED, which] = False
     return loglik - top, 0.5 * change**2 / covariance[which, which]
 
 
@@ -515,18 +494,18 @@ def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     They then exclude read noises that the likelihood does not. One without peaks, 0.8 e-, has the same
     variances with a bias and exposures that are off by the difference of the squares, e-.
     """
-    n, trial = pixel.facts.shape[0], tools.scratch.small[HERE]
-    more = _BLURRED2 - math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
+    n, trial = pixel.facts.shape[0], tools.scratch.small[px.HERE]
+    more = _BLURRED2 - math.exp(best[n + px.LOG_VARIANCE]) / best[n + px.STEP] ** 2
     if more < 0.0 or nats_of_peaks(pixel, best) < _UNSEEN:
         return False
     copy(best, trial)
     for j in range(n):
         trial[j] = math.log(math.exp(best[j]) + more)
-    trial[n + BIAS] -= more * best[n + STEP]
-    trial[n + LOG_VARIANCE] = math.log(_BLURRED2 * best[n + STEP] ** 2)
-    no_starts(tools.scratch.small[HEIGHTS])
+    trial[n + px.BIAS] -= more * best[n + px.STEP]
+    trial[n + px.LOG_VARIANCE] = math.log(_BLURRED2 * best[n + px.STEP] ** 2)
+    no_starts(tools.scratch.small[px.HEIGHTS])
     keep_start(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
-    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, n + LOG_VARIANCE)
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, n + px.LOG_VARIANCE)
     least = tools.limits.gap
     return bool(fall < 2.0 * least and parabola > 2.0 * max(fall, least))
 
@@ -547,9 +526,9 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
     at_best = examine(pixel, tools, best, out)
     if n == 1 and not tools.limits.cells:
         good, _ = settled(pixel, best, clear, math.inf, out)
-        expected = expected_gap(pixel.facts[0, N_FRAMES], best)
+        expected = expected_gap(pixel.facts[0, px.N_FRAMES], best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
-        if good and out[DEGREES] > 0.0 and expected > sure and best[n + STEP] > _FINE_STEP:
+        if good and out[DEGREES] > 0.0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
             return Found(at_best, max(runner_up, at_best - expected), found.degenerate)
     higher, beside = climb_neighbours(pixel, tools, best, loglik)
     if higher > loglik:
@@ -569,7 +548,7 @@ def _climb_start(
 ) -> Found:
     """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
-    known, goal = best[n + STEP] > 0.0, from_start()
+    known, goal = best[n + px.STEP] > 0.0, from_start()
     # of several samples, and of cells, one comb may have two maxima
     if known and n == 1 and not cells:
         goal = goal_beside(True, found.loglik, found.runner_up)
@@ -596,7 +575,7 @@ def climb_starts(
     pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
 ) -> Found:
     """Climb from the starts, the highest first; a higher maximum takes the place of ``best``."""
-    trial = tools.scratch.small[HERE]
+    trial = tools.scratch.small[px.HERE]
     while next_start(tools.scratch, trial):
         found = _climb_start(pixel, tools, clear, found, trial, best, out)
     return found
@@ -630,10 +609,15 @@ def search_density(
     Returns:
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
-    n, trial, limits, used = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits, tools.scratch.used
-    heights, null = tools.scratch.small[HEIGHTS], loglik_without_gain(pixel)
-    best[n + STEP] = 0.0
-    if task.near[n + STEP] > 0.0:
+    n, trial, limits, used = (
+        pixel.facts.shape[0],
+        tools.scratch.small[px.HERE],
+        tools.limits,
+        tools.scratch.used,
+    )
+    heights, null = tools.scratch.small[px.HEIGHTS], loglik_without_gain(pixel)
+    best[n + px.STEP] = 0.0
+    if task.near[n + px.STEP] > 0.0:
         fits, loglik = _stay_near(pixel, tools, task, trial, out)
         if fits:
             copy(trial, best)
@@ -646,12 +630,12 @@ def search_density(
         before = found.loglik
         if clear and attempt == 0:
             most = -math.inf
-            for i in range(N_KEPT):  # the highest is kept
+            for i in range(px.N_KEPT):  # the highest is kept
                 most = max(most, heights[i])
-            for i in range(N_KEPT):
+            for i in range(px.N_KEPT):
                 heights[i] = heights[i] if heights[i] == most else -math.inf
         found = climb_starts(pixel, tools, clear, found, best, out)
-        if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
+        if (n > 1 or attempt == 0) and best[n + px.STEP] > 0.0:
             poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP
             longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
             found = climb_starts(pixel, tools, clear, found, best, out)
@@ -659,7 +643,7 @@ def search_density(
             break
         if limits.quick and found.loglik - null > limits.gap:
             break
-    if not best[n + STEP] > 0.0:
+    if not best[n + px.STEP] > 0.0:
         return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, used[0], 0
     out[LOG_LIKELIHOOD], count = found.loglik, used[0]
     blurred = above_blurred(pixel, tools, best, found.loglik)
