@@ -13,21 +13,8 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.pixel_numba import (
-    DAMPING,
-    HELD,
-    HERE,
-    INFORMATION,
-    LOG_VARIANCE,
-    LOWER,
-    N_BLOCK,
-    N_SHARED,
-    RIGHT,
-    SATELLITE,
-    SCHUR,
-    SCORE,
-    Scratch,
-)
+from pchem_pipeline.model.law import pixel_numba as px
+from pchem_pipeline.model.law.pixel_numba import Scratch
 
 # of the diagonal element: what must be left of it after the other parameters are taken out; a comb that
 # fits whole numbers, whose bias and gain can make up for each other, has less
@@ -81,32 +68,32 @@ def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray)
 @kernel(inline=True, borrows=True)
 def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
     """Do as :func:`solve_arrow` where there are no satellites: by L D L', five times faster."""
-    n, held = at.shape[0], scratch.flags[HELD]
+    n, held = at.shape[0], scratch.flags[px.HELD]
     squared = right1 = right2 = right3 = 0.0
     a11 = a21 = a22 = a31 = a32 = a33 = 0.0
     for j in range(n):
         block = at[j]
         inverse = 0.0
         if not held[j]:
-            own = block[INFORMATION, 0] + share * block[DAMPING, 0]
-            if not own > _SMALLEST * block[DAMPING, 0]:
+            own = block[px.INFORMATION, 0] + share * block[px.DAMPING, 0]
+            if not own > _SMALLEST * block[px.DAMPING, 0]:
                 return math.nan
             inverse = 1.0 / own
-        score = block[SCORE, 0]
+        score = block[px.SCORE, 0]
         squared += score * score * inverse
-        across1 = block[INFORMATION + 1, 0] + share * block[DAMPING + 1, 0]
-        across2 = block[INFORMATION + 2, 0] + share * block[DAMPING + 2, 0]
-        across3 = block[INFORMATION + 3, 0] + share * block[DAMPING + 3, 0]
+        across1 = block[px.INFORMATION + 1, 0] + share * block[px.DAMPING + 1, 0]
+        across2 = block[px.INFORMATION + 2, 0] + share * block[px.DAMPING + 2, 0]
+        across3 = block[px.INFORMATION + 3, 0] + share * block[px.DAMPING + 3, 0]
         factor1, factor2, factor3 = across1 * inverse, across2 * inverse, across3 * inverse
-        right1 += block[SCORE, 1] - factor1 * score
-        right2 += block[SCORE, 2] - factor2 * score
-        right3 += block[SCORE, 3] - factor3 * score
-        a11 += block[INFORMATION + 1, 1] + share * block[DAMPING + 1, 1] - factor1 * across1
-        a21 += block[INFORMATION + 2, 1] + share * block[DAMPING + 2, 1] - factor2 * across1
-        a22 += block[INFORMATION + 2, 2] + share * block[DAMPING + 2, 2] - factor2 * across2
-        a31 += block[INFORMATION + 3, 1] + share * block[DAMPING + 3, 1] - factor3 * across1
-        a32 += block[INFORMATION + 3, 2] + share * block[DAMPING + 3, 2] - factor3 * across2
-        a33 += block[INFORMATION + 3, 3] + share * block[DAMPING + 3, 3] - factor3 * across3
+        right1 += block[px.SCORE, 1] - factor1 * score
+        right2 += block[px.SCORE, 2] - factor2 * score
+        right3 += block[px.SCORE, 3] - factor3 * score
+        a11 += block[px.INFORMATION + 1, 1] + share * block[px.DAMPING + 1, 1] - factor1 * across1
+        a21 += block[px.INFORMATION + 2, 1] + share * block[px.DAMPING + 2, 1] - factor2 * across1
+        a22 += block[px.INFORMATION + 2, 2] + share * block[px.DAMPING + 2, 2] - factor2 * across2
+        a31 += block[px.INFORMATION + 3, 1] + share * block[px.DAMPING + 3, 1] - factor3 * across1
+        a32 += block[px.INFORMATION + 3, 2] + share * block[px.DAMPING + 3, 2] - factor3 * across2
+        a33 += block[px.INFORMATION + 3, 3] + share * block[px.DAMPING + 3, 3] - factor3 * across3
     if held[n]:
         a11, a21, a31, right1 = 1.0, 0.0, 0.0, 0.0
     if held[n + 1]:
@@ -126,15 +113,17 @@ def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, st
     step3 = right3 / d3
     step2 = right2 / d2 - l32 * step3
     step1 = right1 / a11 - l21 * step2 - l31 * step3
-    step[n], step[n + 1], step[n + 2], step[n + SATELLITE] = step1, step2, step3, 0.0
+    step[n], step[n + 1], step[n + 2], step[n + px.SATELLITE] = step1, step2, step3, 0.0
     for j in range(n):
         block = at[j]
         step[j] = 0.0
         if not held[j]:
-            value = block[SCORE, 0] - (block[INFORMATION + 1, 0] + share * block[DAMPING + 1, 0]) * step1
-            value -= (block[INFORMATION + 2, 0] + share * block[DAMPING + 2, 0]) * step2
-            value -= (block[INFORMATION + 3, 0] + share * block[DAMPING + 3, 0]) * step3
-            step[j] = value / (block[INFORMATION, 0] + share * block[DAMPING, 0])
+            value = (
+                block[px.SCORE, 0] - (block[px.INFORMATION + 1, 0] + share * block[px.DAMPING + 1, 0]) * step1
+            )
+            value -= (block[px.INFORMATION + 2, 0] + share * block[px.DAMPING + 2, 0]) * step2
+            value -= (block[px.INFORMATION + 3, 0] + share * block[px.DAMPING + 3, 0]) * step3
+            step[j] = value / (block[px.INFORMATION, 0] + share * block[px.DAMPING, 0])
     return squared + right1 * right1 / a11 + right2 * right2 / d2 + right3 * step3
 
 
@@ -144,52 +133,54 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
 
     Return the squared decrement, NaN unless the matrix is positive definite.
     """
-    n, held, small = at.shape[0], scratch.flags[HELD], scratch.small
-    if held[n + SATELLITE]:
+    n, held, small = at.shape[0], scratch.flags[px.HELD], scratch.small
+    if held[n + px.SATELLITE]:
         return float(_solve_without_satellites(at, share, scratch, step))
-    right, schur, lower = small[RIGHT], small[SCHUR:LOWER], small[LOWER:HERE]
-    for row in range(1, N_BLOCK):
+    right, schur, lower = small[px.RIGHT], small[px.SCHUR : px.LOWER], small[px.LOWER : px.HERE]
+    for row in range(1, px.N_BLOCK):
         right[row] = 0.0
         for column in range(1, row + 1):
             schur[row, column] = 0.0
     squared = 0.0
     for j in range(n):
         block = at[j]
-        for row in range(1, N_BLOCK):
-            right[row] += block[SCORE, row]
+        for row in range(1, px.N_BLOCK):
+            right[row] += block[px.SCORE, row]
             for column in range(1, row + 1):
-                schur[row, column] += block[INFORMATION + row, column] + share * block[DAMPING + row, column]
+                schur[row, column] += (
+                    block[px.INFORMATION + row, column] + share * block[px.DAMPING + row, column]
+                )
         if held[j]:
             continue
-        own = block[INFORMATION, 0] + share * block[DAMPING, 0]
-        if not own > _SMALLEST * block[DAMPING, 0]:
+        own = block[px.INFORMATION, 0] + share * block[px.DAMPING, 0]
+        if not own > _SMALLEST * block[px.DAMPING, 0]:
             return math.nan
-        squared += block[SCORE, 0] * block[SCORE, 0] / own
-        for row in range(1, N_BLOCK):
-            across = block[INFORMATION + row, 0] + share * block[DAMPING + row, 0]
+        squared += block[px.SCORE, 0] * block[px.SCORE, 0] / own
+        for row in range(1, px.N_BLOCK):
+            across = block[px.INFORMATION + row, 0] + share * block[px.DAMPING + row, 0]
             factor = across / own
-            right[row] -= factor * block[SCORE, 0]
+            right[row] -= factor * block[px.SCORE, 0]
             for column in range(1, row + 1):
                 schur[row, column] -= factor * (
-                    block[INFORMATION + column, 0] + share * block[DAMPING + column, 0]
+                    block[px.INFORMATION + column, 0] + share * block[px.DAMPING + column, 0]
                 )
-    for row in range(1, N_BLOCK):
+    for row in range(1, px.N_BLOCK):
         if held[n + row - 1]:
             right[row] = 0.0
-    if not cholesky(schur, 1, N_BLOCK, _SINGULAR, held[n:], lower):
+    if not cholesky(schur, 1, px.N_BLOCK, _SINGULAR, held[n:], lower):
         return math.nan
-    squared += float(back_substitute(lower, 1, N_BLOCK, right))
-    for row in range(1, N_BLOCK):
+    squared += float(back_substitute(lower, 1, px.N_BLOCK, right))
+    for row in range(1, px.N_BLOCK):
         step[n + row - 1] = 0.0 if held[n + row - 1] else right[row]
     for j in range(n):
         block = at[j]
         step[j] = 0.0
         if not held[j]:
-            value = block[SCORE, 0]
-            for row in range(1, N_BLOCK):
-                across = block[INFORMATION + row, 0] + share * block[DAMPING + row, 0]
+            value = block[px.SCORE, 0]
+            for row in range(1, px.N_BLOCK):
+                across = block[px.INFORMATION + row, 0] + share * block[px.DAMPING + row, 0]
                 value -= across * step[n + row - 1]
-            step[j] = value / (block[INFORMATION, 0] + share * block[DAMPING, 0])
+            step[j] = value / (block[px.INFORMATION, 0] + share * block[px.DAMPING, 0])
     return squared
 
 
@@ -202,47 +193,51 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance:
     definite.
     """
     n = at.shape[0]
-    factors, own = np.zeros((n, N_BLOCK)), np.zeros(n)
-    schur, lower, column = np.zeros((N_BLOCK, N_BLOCK)), np.zeros((N_BLOCK, N_BLOCK)), np.zeros(N_BLOCK)
-    for row in range(n + N_SHARED):
-        for other in range(n + N_SHARED):
+    factors, own = np.zeros((n, px.N_BLOCK)), np.zeros(n)
+    schur, lower, column = (
+        np.zeros((px.N_BLOCK, px.N_BLOCK)),
+        np.zeros((px.N_BLOCK, px.N_BLOCK)),
+        np.zeros(px.N_BLOCK),
+    )
+    for row in range(n + px.N_SHARED):
+        for other in range(n + px.N_SHARED):
             covariance[row, other] = 0.0
     for j in range(n):
         block = at[j]
-        for row in range(1, N_BLOCK):
+        for row in range(1, px.N_BLOCK):
             for other in range(1, row + 1):
-                schur[row, other] += block[INFORMATION + row, other]
+                schur[row, other] += block[px.INFORMATION + row, other]
         if held[j]:
             continue
         exposure = math.exp(theta[j])
-        own[j] = (block[INFORMATION, 0] + block[SCORE, 0]) / (exposure * exposure)
+        own[j] = (block[px.INFORMATION, 0] + block[px.SCORE, 0]) / (exposure * exposure)
         if not own[j] > 0.0:
             return False
-        for row in range(1, N_BLOCK):
-            factors[j, row] = block[INFORMATION + row, 0] / exposure / own[j]
-        for row in range(1, N_BLOCK):
+        for row in range(1, px.N_BLOCK):
+            factors[j, row] = block[px.INFORMATION + row, 0] / exposure / own[j]
+        for row in range(1, px.N_BLOCK):
             for other in range(1, row + 1):
                 schur[row, other] -= factors[j, row] * factors[j, other] * own[j]
-    if not cholesky(schur, 1, N_BLOCK, _SINGULAR, held[n:], lower):
+    if not cholesky(schur, 1, px.N_BLOCK, _SINGULAR, held[n:], lower):
         return False
-    for i in range(1, N_BLOCK):
+    for i in range(1, px.N_BLOCK):
         if held[n + i - 1]:
             continue
-        for row in range(1, N_BLOCK):
+        for row in range(1, px.N_BLOCK):
             column[row] = 1.0 if row == i else 0.0
-        back_substitute(lower, 1, N_BLOCK, column)
-        for row in range(1, N_BLOCK):
+        back_substitute(lower, 1, px.N_BLOCK, column)
+        for row in range(1, px.N_BLOCK):
             covariance[n + row - 1, n + i - 1] = 0.0 if held[n + row - 1] else column[row]
     for j in range(n):
-        for i in range(N_SHARED):
+        for i in range(px.N_SHARED):
             value = 0.0
-            for row in range(1, N_BLOCK):
+            for row in range(1, px.N_BLOCK):
                 value += covariance[n + i, n + row - 1] * factors[j, row]
             covariance[j, n + i] = covariance[n + i, j] = -value
     for j in range(n):
         for other in range(n):
             value = 0.0
-            for row in range(1, N_BLOCK):
+            for row in range(1, px.N_BLOCK):
                 value -= covariance[j, n + row - 1] * factors[other, row]
             covariance[j, other] = value
         if not held[j]:
@@ -260,9 +255,9 @@ def enclose(at: FloatArray, theta: FloatArray, covariance: FloatArray) -> None:
     middle, half = np.zeros((size, size)), np.zeros((size, size))
     for j in range(n):
         scale = math.exp(-theta[j])
-        for row in range(N_BLOCK):
+        for row in range(px.N_BLOCK):
             for column in range(row + 1):
-                value = at[j, DAMPING + row, column]
+                value = at[j, px.DAMPING + row, column]
                 value *= (scale if row == 0 else 1.0) * (scale if column == 0 else 1.0)
                 place = j if row == 0 else n + row - 1
                 other = j if column == 0 else n + column - 1
@@ -306,10 +301,10 @@ def to_natural(
         covariance: out, shape (J + 3, J + 3).
     """
     n = dark.size
-    slope = np.ones(n + N_SHARED)
+    slope = np.ones(n + px.N_SHARED)
     for j in range(n):
         parameters[j] = 0.0 if dark[j] else math.exp(theta[j])
-    variance = math.exp(theta[n + LOG_VARIANCE])
+    variance = math.exp(theta[n + px.LOG_VARIANCE])
     parameters[n] = 1.0 / theta[n]
     parameters[n + 1] = theta[n + 1]
     parameters[n + 2] = math.sqrt(variance + rounding)

@@ -10,20 +10,9 @@ from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.density_scores_numba import N_MEANS, density_scores, posterior
-from pchem_pipeline.model.law.pixel_numba import (
-    BIAS,
-    CENTRE,
-    DAMPING,
-    DARK,
-    FIRST,
-    LOG_VARIANCE,
-    N_BINS,
-    STEP,
-    SUMS,
-    WEIGHT,
-    Pixel,
-)
+from pchem_pipeline.model.law.pixel_numba import Pixel
 
 
 @kernel
@@ -34,17 +23,17 @@ def fill_squared_scores(pixel: Pixel, theta: FloatArray, at: FloatArray) -> None
     """
     n = pixel.facts.shape[0]
     means, score = np.empty(N_MEANS), np.empty(4)
-    step, sigma = theta[n + STEP], math.exp(0.5 * theta[n + LOG_VARIANCE])
+    step, sigma = theta[n + px.STEP], math.exp(0.5 * theta[n + px.LOG_VARIANCE])
     slope = np.empty(4)
     slope[1], slope[2], slope[3] = -1.0 / (step * step), 1.0, 0.5 * sigma
     for j in range(n):
-        facts, first, n_bins = pixel.facts[j], pixel.facts[j, FIRST], int(pixel.facts[j, N_BINS])
-        at[j, DAMPING:SUMS] = 0.0
-        dark = facts[DARK] > 0.0
-        exposure, bias = math.exp(theta[j]), theta[n + BIAS] - facts[CENTRE]
+        facts, first, n_bins = pixel.facts[j], pixel.facts[j, px.FIRST], int(pixel.facts[j, px.N_BINS])
+        at[j, px.DAMPING : px.SUMS] = 0.0
+        dark = facts[px.DARK] > 0.0
+        exposure, bias = math.exp(theta[j]), theta[n + px.BIAS] - facts[px.CENTRE]
         slope[0] = exposure
         for i in range(n_bins):
-            c = pixel.bins[j, WEIGHT, i]
+            c = pixel.bins[j, px.WEIGHT, i]
             if c == 0.0:
                 continue
             posterior(first + i, 0.0 if dark else exposure, step, bias, sigma, means)
@@ -52,7 +41,7 @@ def fill_squared_scores(pixel: Pixel, theta: FloatArray, at: FloatArray) -> None
             for row in range(4):
                 for column in range(row + 1):
                     product = score[row] * slope[row] * score[column] * slope[column]
-                    at[j, DAMPING + row, column] += c * product
+                    at[j, px.DAMPING + row, column] += c * product
 
 
 @kernel

@@ -38,7 +38,6 @@ from pchem_pipeline.model.fit.search_numba import (
     judge,
     loglik_without_gain,
     nats_of_peaks,
-    plus,
     rival_moves_gain,
     score_of,
 )
@@ -51,35 +50,8 @@ from pchem_pipeline.model.fit.starts_numba import (
     no_starts,
     scan_steps,
 )
-from pchem_pipeline.model.law.pixel_numba import (
-    ADDED_EXPOSURE,
-    ADDED_WEIGHT,
-    BIAS,
-    BOTTOM,
-    CUMULATIVE,
-    DARK,
-    EXTRA_DN2,
-    EXTRA_E2,
-    FIRST,
-    FIXED,
-    HEIGHTS,
-    HERE,
-    LOG_VARIANCE,
-    N_BINS,
-    N_FRAMES,
-    N_PEAKS,
-    PER_ELECTRON,
-    PER_ELECTRON2,
-    SATELLITE,
-    SHARE,
-    STEP,
-    TOP,
-    VARIANCE,
-    WEIGHT,
-    WIDTH,
-    Pixel,
-    copy,
-)
+from pchem_pipeline.model.law import pixel_numba as px
+from pchem_pipeline.model.law.pixel_numba import Pixel, copy
 
 _LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
 # of the variance and the exposure of the density's fit, left to the pixel itself at the start
@@ -102,30 +74,30 @@ def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray)
     """
     n = pixel.facts.shape[0]
     copy(near, theta)
-    a = near[n + STEP]
+    a = near[n + px.STEP]
     analog2 = max(
-        math.exp(near[n + LOG_VARIANCE]) - QUANTISATION_VARIANCE, _LEAST_VARIANCE if not warm else 1e-6
+        math.exp(near[n + px.LOG_VARIANCE]) - QUANTISATION_VARIANCE, _LEAST_VARIANCE if not warm else 1e-6
     )
     left = frames = 0.0
     for j in range(n):
         facts, k = pixel.facts[j], math.exp(near[j])
-        if facts[DARK] > 0.0:
+        if facts[px.DARK] > 0.0:
             k = 0.0
         elif not warm:
             exposure = k
             for i in range(pixel.mixtures.shape[2]):
-                exposure -= pixel.mixtures[j, ADDED_WEIGHT, i] * pixel.mixtures[j, ADDED_EXPOSURE, i]
+                exposure -= pixel.mixtures[j, px.ADDED_WEIGHT, i] * pixel.mixtures[j, px.ADDED_EXPOSURE, i]
             theta[j] = math.log(max(exposure, _LEAST_SHARE * k))
-        spread = facts[EXTRA_E2] + k * (facts[PER_ELECTRON] + k * facts[PER_ELECTRON2])
+        spread = facts[px.EXTRA_E2] + k * (facts[px.PER_ELECTRON] + k * facts[px.PER_ELECTRON2])
         own = 0.0
-        for i in range(int(facts[N_PEAKS])):
-            own += pixel.peaks[j, SHARE, i] * pixel.peaks[j, WIDTH, i] ** 2
-        left += facts[N_FRAMES] * (analog2 - a * a * spread - facts[EXTRA_DN2]) / own
-        frames += facts[N_FRAMES]
+        for i in range(int(facts[px.N_PEAKS])):
+            own += pixel.peaks[j, px.SHARE, i] * pixel.peaks[j, px.WIDTH, i] ** 2
+        left += facts[px.N_FRAMES] * (analog2 - a * a * spread - facts[px.EXTRA_DN2]) / own
+        frames += facts[px.N_FRAMES]
     if not warm:
         analog2 = max(left / frames, _LEAST_SHARE * analog2)
-    theta[n + LOG_VARIANCE] = math.log(analog2)
-    theta[n + SATELLITE] = 0.0
+    theta[n + px.LOG_VARIANCE] = math.log(analog2)
+    theta[n + px.SATELLITE] = 0.0
 
 
 @kernel(borrows=True)
@@ -134,36 +106,35 @@ def _share_at_limits(pixel: Pixel) -> float:
     largest = 0.0
     for j in range(pixel.facts.shape[0]):
         facts, found = pixel.facts[j], 0.0
-        for i in range(int(facts[N_BINS])):
-            if i <= facts[BOTTOM] or i + 1 >= facts[TOP]:
-                found += pixel.bins[j, WEIGHT, i]
-        largest = max(largest, found / facts[N_FRAMES])
+        for i in range(int(facts[px.N_BINS])):
+            if i <= facts[px.BOTTOM] or i + 1 >= facts[px.TOP]:
+                found += pixel.bins[j, px.WEIGHT, i]
+        largest = max(largest, found / facts[px.N_FRAMES])
     return largest
 
 
 @kernel(borrows=True)
-def _scan_cut(pixel: Pixel, tools: Tools) -> int:
-    """Put the likeliest combs of a cut sample among the starts; return the evaluations.
+def _scan_cut(pixel: Pixel, tools: Tools) -> None:
+    """Put the likeliest combs of a cut sample among the starts.
 
     Of a cut histogram the median stays. So steps from the range of the sample down, exposures, and biases
     around the one that has the median right are all tried.
     """
-    trial, place, used = tools.scratch.small[HERE], 0, 0
-    facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
-    no_starts(tools.scratch.small[HEIGHTS])
-    while cumulative[place + 1] < 0.5 * facts[N_FRAMES]:
+    trial, place = tools.scratch.small[px.HERE], 0
+    facts, cumulative = pixel.facts[0], pixel.bins[0, px.CUMULATIVE]
+    no_starts(tools.scratch.small[px.HEIGHTS])
+    while cumulative[place + 1] < 0.5 * facts[px.N_FRAMES]:
         place += 1
-    a, least = facts[N_BINS] + 1.0, max(0.25 * math.sqrt(facts[VARIANCE]), LEAST_STEP)
+    a, least = facts[px.N_BINS] + 1.0, max(0.25 * math.sqrt(facts[px.VARIANCE]), LEAST_STEP)
     while a > least:
         for exposure in _CUT_EXPOSURES:
             middle = max(exposure - 0.3, 0.0)  # e-: the median of the electrons, to a third
             for around in range(-_AROUND, _AROUND + 1):
-                trial[0], trial[1 + STEP], trial[1 + SATELLITE] = math.log(exposure), a, 0.0
-                trial[1 + BIAS] = facts[FIRST] + place - a * (middle + around / _STEPS)
-                trial[1 + LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
-                used += keep_start(pixel, tools.evaluate, True, tools.scratch)
+                trial[0], trial[1 + px.STEP], trial[1 + px.SATELLITE] = math.log(exposure), a, 0.0
+                trial[1 + px.BIAS] = facts[px.FIRST] + place - a * (middle + around / _STEPS)
+                trial[1 + px.LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
+                keep_start(pixel, tools.evaluate, True, tools.scratch)
         a /= _CUT_RATIO
-    return used
 
 
 @kernel(borrows=True)
@@ -171,35 +142,34 @@ def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, fo
     """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
-        used = scan_steps(pixel, tools.evaluate, True, scratch)
+        scan_steps(pixel, tools.evaluate, True, scratch)
     else:
-        _, used = fill_starts(1, False, pixel, tools.basis, tools.evaluate, scratch)
-        used += add_line_starts(pixel, tools.evaluate, True, True, scratch)
-    found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+        fill_starts(1, False, pixel, tools.basis, tools.evaluate, scratch)
+        add_line_starts(pixel, tools.evaluate, True, True, scratch)
+    found = climb_starts(pixel, tools, False, found, best, out)
     return found
 
 
 @kernel(borrows=True)
 def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray) -> Found:
     """Climb from a fit with the density, what the law adds taken off, or else from the fit as it is."""
-    trial, used = tools.scratch.small[HERE], 0
+    trial = tools.scratch.small[px.HERE]
     for as_it_is in (tools.limits.warm, np.bool_(True)):
         _from_density(pixel, as_it_is, near, trial)
-        outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
-        used += count
+        outcome, loglik = climb_on(pixel, tools, from_start(), trial, trial)
         if outcome == CONVERGED:
             copy(trial, best)
-            return Found(loglik, -math.inf, used, np.bool_(False))
-    return Found(-math.inf, -math.inf, used, np.bool_(False))
+            return Found(loglik, -math.inf, np.bool_(False))
+    return Found(-math.inf, -math.inf, np.bool_(False))
 
 
 @kernel
 def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
     """Return whether the log-likelihood of a single sample is flat towards 2 DN per electron."""
-    if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO:
+    if abs(1.0 / best[1 + px.STEP] - 0.5) > NEAR_TWO:
         return False
     combs_of_step(pixel, tools.evaluate, 2.0, tools.scratch)
-    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, 1 + STEP)
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, 1 + px.STEP)
     return bool(fall < CLEAR_GAP and 2.0 * fall < parabola)
 
 
@@ -221,10 +191,10 @@ def _start_anew(
     another law also those with a near rival.
     """
     n, limits = pixel.facts.shape[0], tools.limits
-    place = n + STEP
+    place = n + px.STEP
     if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
-        used = _scan_cut(pixel, tools)
-        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+        _scan_cut(pixel, tools)
+        found = climb_starts(pixel, tools, False, found, best, out)
     few = not best[place] > FEW_STEP
     astray = few or score > SUSPICIOUS
     rivalled = n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap
@@ -234,13 +204,13 @@ def _start_anew(
     if not (limits.scan and best[place] < ALIASED_STEP):
         return found
     if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
-        used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+        alias_of_step(pixel, tools.evaluate, best, tools.scratch)
+        found = climb_starts(pixel, tools, False, found, best, out)
     elif n == 1:
         for nearer in (1.0, 3.0):
             a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
-            used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
-            found = climb_starts(pixel, tools, False, plus(found, used), best, out)
+            combs_of_step(pixel, tools.evaluate, a, tools.scratch)
+            found = climb_starts(pixel, tools, False, found, best, out)
     return found
 
 
@@ -250,16 +220,16 @@ def _try_satellites(
 ) -> Found:
     """Try free satellites of each amplitude; ``out`` is that of the fit with those that are kept."""
     n = pixel.facts.shape[0]
-    noise = math.exp(0.5 * best[n + LOG_VARIANCE]) / best[n + STEP]
+    noise = math.exp(0.5 * best[n + px.LOG_VARIANCE]) / best[n + px.STEP]
     poor = score_of(out) > _SUSPICIOUS or noise > _UNRESOLVED
-    amplitude, count = search_satellites(
+    amplitude = search_satellites(
         best, found.loglik, pixel, task.law, task.row, task.amplitudes, unsure, poor, tools
     )
     loglik = examine(pixel, tools, best, out)
     if amplitude > 0.0:
         out[DEGREES] = max(out[DEGREES] - 2.0, 0.0)
-    out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + SATELLITE]
-    return Found(loglik, found.runner_up, found.used + count + 1, found.degenerate)
+    out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + px.SATELLITE]
+    return Found(loglik, found.runner_up, found.degenerate)
 
 
 def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
@@ -276,29 +246,28 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         results as of :func:`.search_numba.search_density`.
         """
         n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
-        known = task.near[n + STEP] > 0.0
+        known = task.near[n + px.STEP] > 0.0
         gap, score = task.gap if known else math.inf, math.inf
-        best[n + STEP] = 0.0
-        tools.scratch.flags[FIXED, n + SATELLITE] = True
+        best[n + px.STEP] = 0.0
+        tools.scratch.flags[px.FIXED, n + px.SATELLITE] = True
         out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
-        found = Found(-math.inf, -math.inf, 0, np.bool_(False))
+        found = Found(-math.inf, -math.inf, np.bool_(False))
         at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
         cut = n == 1 and at_limits
         if known:
             found = _climb_known(pixel, tools, task.near, best)
-        if best[n + STEP] > 0.0:
-            loglik, runner_up, used = found.loglik, found.runner_up, found.used
+        if best[n + px.STEP] > 0.0:
+            loglik, runner_up = found.loglik, found.runner_up
             if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
-                loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
-                used += count
+                loglik, runner_up = climb_neighbours(pixel, tools, best, loglik)
                 if runner_up > -math.inf and (cut or not limits.scan):
                     gap = math.inf  # that of another law, or of a sample that nothing cuts
             examine(pixel, tools, best, out)
             score = score_of(out)
-            found = Found(loglik, runner_up, used + 1, found.degenerate)
+            found = Found(loglik, runner_up, found.degenerate)
         found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
-        if not best[n + STEP] > 0.0:
-            return FIT_NOT_CONVERGED, found.used, 0
+        if not best[n + px.STEP] > 0.0:
+            return FIT_NOT_CONVERGED, tools.scratch.used[0], 0
         bias_gap = min(gap, found.loglik - found.runner_up)
         blurred = math.inf
         if n == 1 and not (limits.warm or limits.reshapes):
@@ -306,17 +275,17 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         gap = min(bias_gap, found.loglik - null, blurred)
         if satellites and task.amplitudes.size > 0:
             found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
-        out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
+        out[LOG_LIKELIHOOD], out[GAP], used = found.loglik, gap, tools.scratch.used[0]
         # the density has told whether there is a gain: it knows no other law than one Gaussian does
         above_null = math.inf if known else found.loglik - null
         of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
         of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
         # of several samples, combs that the limits leave open are not looked for
-        unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + STEP] < FEW_STEP
+        unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + px.STEP] < FEW_STEP
         if n == 1:
             unsure = bias_gap < limits.gap
         of_gain = of_gain or (at_limits and unsure)
         word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
-        return word, found.used, int(out[DEGREES])
+        return word, used, int(out[DEGREES])
 
     return search_cells

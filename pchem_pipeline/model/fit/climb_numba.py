@@ -18,35 +18,8 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import solve_arrow
-from pchem_pipeline.model.law.pixel_numba import (
-    AHEAD,
-    AT,
-    BIAS,
-    DAMPING,
-    DERIVATIVES,
-    FIXED,
-    HELD,
-    INFORMATION,
-    KNOWN,
-    LOG_VARIANCE,
-    N_BLOCK,
-    N_FRAMES,
-    SATELLITE,
-    SCORE,
-    STEP,
-    STEPS,
-    SUM_E,
-    SUM_EE,
-    SUM_K,
-    SUM_KE,
-    SUM_KK,
-    SUMS,
-    TRIAL,
-    Pixel,
-    Scratch,
-    copy,
-    copy_evaluation,
-)
+from pchem_pipeline.model.law import pixel_numba as px
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch, copy, copy_evaluation
 
 # outcomes
 CONVERGED = 0
@@ -125,18 +98,19 @@ def min_log_variance(a: float, cells: bool) -> float:
 @kernel(borrows=True)
 def keep_inside(theta: FloatArray, limits: Limits) -> None:
     """Move ``theta`` to the nearest allowed values."""
-    n = theta.size - N_BLOCK + 1
+    n = theta.size - px.N_BLOCK + 1
     for j in range(n):
         theta[j] = max(limits.bound, theta[j])
-    theta[n + LOG_VARIANCE] = max(theta[n + LOG_VARIANCE], min_log_variance(theta[n + STEP], limits.cells))
-    theta[n + SATELLITE] = min(max(theta[n + SATELLITE], 0.0), MOST_SATELLITE)
+    floor = min_log_variance(theta[n + px.STEP], limits.cells)
+    theta[n + px.LOG_VARIANCE] = max(theta[n + px.LOG_VARIANCE], floor)
+    theta[n + px.SATELLITE] = min(max(theta[n + px.SATELLITE], 0.0), MOST_SATELLITE)
 
 
 @kernel(borrows=True)
 def brightest(theta: FloatArray) -> float:
     """Return the largest log H."""
     most: float = theta[0]
-    for j in range(1, theta.size - N_BLOCK + 1):
+    for j in range(1, theta.size - px.N_BLOCK + 1):
         most = max(most, theta[j])
     return most
 
@@ -144,11 +118,11 @@ def brightest(theta: FloatArray) -> float:
 @kernel(borrows=True)
 def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
     """Return whether parameters that are sought are where they can be told from those of Gaussians."""
-    n = theta.size - N_BLOCK + 1
-    a = theta[n + STEP]
-    noise = math.exp(0.5 * theta[n + LOG_VARIANCE]) / a
+    n = theta.size - px.N_BLOCK + 1
+    a = theta[n + px.STEP]
+    noise = math.exp(0.5 * theta[n + px.LOG_VARIANCE]) / a
     least = LEAST_STEP if cells else MIN_STEP
-    inside = longest_step == KNOWN or (noise < MAX_ELECTRON_NOISE and least < a < longest_step)
+    inside = longest_step == px.KNOWN or (noise < MAX_ELECTRON_NOISE and least < a < longest_step)
     return bool(inside and brightest(theta) < MAX_LOG_EXPOSURE)
 
 
@@ -159,13 +133,13 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
     The bias is the same within 0.3 e-, and so is the mean of the brightest sample; with the density of one
     sample the step within 10 %. Of cells of few DN per electron maxima are closer: a tenth of that.
     """
-    n = left.size - N_BLOCK + 1
-    a, most = left[n + STEP], _BRIGHT
+    n = left.size - px.N_BLOCK + 1
+    a, most = left[n + px.STEP], _BRIGHT
     reach = (0.03 if cells and a < FEW_STEP else 0.3) * a
     if n > 1 or cells:
         most = max(math.exp(brightest(left)), _BRIGHT)
-    near = abs(left[n + BIAS] - right[n + BIAS]) < reach
-    return bool(near and abs(a - right[n + STEP]) * most < reach)
+    near = abs(left[n + px.BIAS] - right[n + px.BIAS]) < reach
+    return bool(near and abs(a - right[n + px.STEP]) * most < reach)
 
 
 @kernel(borrows=True)
@@ -174,16 +148,16 @@ def find_held(theta: FloatArray, at: FloatArray, fixed: BoolArray, limits: Limit
     n = at.shape[0]
     noise = satellite = 0.0
     for j in range(n):
-        held[j] = fixed[j] or (theta[j] <= limits.bound + 1e-12 and at[j, SCORE, 0] <= 0.0)
-        noise += at[j, SCORE, 1 + LOG_VARIANCE]
-        satellite += at[j, SCORE, 1 + SATELLITE]
-    held[n + STEP], held[n + BIAS] = fixed[n + STEP], fixed[n + BIAS]
-    floor = min_log_variance(theta[n + STEP], limits.cells)
-    at_floor = theta[n + LOG_VARIANCE] <= floor + 1e-12 and noise <= 0.0
-    held[n + LOG_VARIANCE] = fixed[n + LOG_VARIANCE] or at_floor
-    weight = theta[n + SATELLITE]
+        held[j] = fixed[j] or (theta[j] <= limits.bound + 1e-12 and at[j, px.SCORE, 0] <= 0.0)
+        noise += at[j, px.SCORE, 1 + px.LOG_VARIANCE]
+        satellite += at[j, px.SCORE, 1 + px.SATELLITE]
+    held[n + px.STEP], held[n + px.BIAS] = fixed[n + px.STEP], fixed[n + px.BIAS]
+    floor = min_log_variance(theta[n + px.STEP], limits.cells)
+    at_floor = theta[n + px.LOG_VARIANCE] <= floor + 1e-12 and noise <= 0.0
+    held[n + px.LOG_VARIANCE] = fixed[n + px.LOG_VARIANCE] or at_floor
+    weight = theta[n + px.SATELLITE]
     at_end = (weight <= 0.0 and satellite <= 0.0) or (weight >= MOST_SATELLITE and satellite >= 0.0)
-    held[n + SATELLITE] = fixed[n + SATELLITE] or at_end
+    held[n + px.SATELLITE] = fixed[n + px.SATELLITE] or at_end
 
 
 @kernel(inline=True, borrows=True)
@@ -195,10 +169,10 @@ def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out
     samples = at.shape[0]
     n = sum_k = sum_kk = sum_ke = sum_e = sum_ee = 0.0
     for j in range(samples):
-        sums = at[j, SUMS]
-        n += pixel.facts[j, N_FRAMES]
-        sum_k, sum_kk, sum_ke = sum_k + sums[SUM_K], sum_kk + sums[SUM_KK], sum_ke + sums[SUM_KE]
-        sum_e, sum_ee = sum_e + sums[SUM_E], sum_ee + sums[SUM_EE]
+        sums = at[j, px.SUMS]
+        n += pixel.facts[j, px.N_FRAMES]
+        sum_k, sum_kk, sum_ke = sum_k + sums[px.SUM_K], sum_kk + sums[px.SUM_KK], sum_ke + sums[px.SUM_KE]
+        sum_e, sum_ee = sum_e + sums[px.SUM_E], sum_ee + sums[px.SUM_EE]
     exposure = sum_k / n
     spread = sum_kk / n - exposure * exposure
     if not (exposure > 0.0 and spread > 0.0):
@@ -206,17 +180,17 @@ def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out
     mean_e = sum_e / n
     # C - xbar A = a (B - A^2) + (sum of k e - A sum of e) / N
     change = (sum_ke / n - exposure * mean_e) / spread
-    a = theta[samples + STEP] + change
+    a = theta[samples + px.STEP] + change
     residual = sum_ee / n - mean_e * mean_e - change * change * spread
     if not (a > 0.0 and math.isfinite(a)):
         return False
     copy(theta, out)
     for j in range(samples):
-        own = at[j, SUMS, SUM_K] / pixel.facts[j, N_FRAMES]
+        own = at[j, px.SUMS, px.SUM_K] / pixel.facts[j, px.N_FRAMES]
         out[j] = max(limits.bound, math.log(own)) if own > 0.0 else limits.bound
-    out[samples + STEP] = a
-    out[samples + BIAS] = theta[samples + BIAS] + mean_e - change * exposure
-    out[samples + LOG_VARIANCE] = max(min_log_variance(a, limits.cells), math.log(max(residual, 1e-3)))
+    out[samples + px.STEP] = a
+    out[samples + px.BIAS] = theta[samples + px.BIAS] + mean_e - change * exposure
+    out[samples + px.LOG_VARIANCE] = max(min_log_variance(a, limits.cells), math.log(max(residual, 1e-3)))
     return True
 
 
@@ -245,19 +219,19 @@ def _take_step(theta: FloatArray, step: FloatArray, tied: float, limits: Limits,
 
     With ``tied`` not negative the read noise in e- stays, that variance of rounding (DN^2) included.
     """
-    n = theta.size - N_BLOCK + 1
-    a = theta[n + STEP]
-    longest = max(abs(step[n + STEP]) / (0.1 * a), abs(step[n + BIAS]) / (0.4 * a))
-    longest = max(longest, abs(step[n + LOG_VARIANCE]) / 0.5, abs(step[n + SATELLITE]) / 0.3)
+    n = theta.size - px.N_BLOCK + 1
+    a = theta[n + px.STEP]
+    longest = max(abs(step[n + px.STEP]) / (0.1 * a), abs(step[n + px.BIAS]) / (0.4 * a))
+    longest = max(longest, abs(step[n + px.LOG_VARIANCE]) / 0.5, abs(step[n + px.SATELLITE]) / 0.3)
     for j in range(n):
         longest = max(longest, abs(step[j]) / 0.5)
     factor = 1.0 if longest <= 1.0 else 1.0 / longest
     for i in range(theta.size):
         out[i] = theta[i] + factor * step[i]
     if tied >= 0.0:
-        ratio = out[n + STEP] / a
-        variance = (math.exp(theta[n + LOG_VARIANCE]) + tied) * ratio * ratio - tied
-        out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
+        ratio = out[n + px.STEP] / a
+        variance = (math.exp(theta[n + px.LOG_VARIANCE]) + tied) * ratio * ratio - tied
+        out[n + px.LOG_VARIANCE] = math.log(max(variance, 1e-12))
     keep_inside(out, limits)
     return factor
 
@@ -269,29 +243,29 @@ def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
     With ``v = log(a^2 w - r)``, r the variance of rounding where v leaves it out: ``dv/da = 2 k / a`` and
     ``d2v/da2 = (2 k - 4 k^2) / a^2`` with ``k = 1 + r exp(-v)``.
     """
-    n = theta.size - N_BLOCK + 1
-    a, step, noise = theta[n + STEP], 1 + STEP, 1 + LOG_VARIANCE
-    k = 1.0 + rounding * math.exp(-theta[n + LOG_VARIANCE])
+    n = theta.size - px.N_BLOCK + 1
+    a, step, noise = theta[n + px.STEP], 1 + px.STEP, 1 + px.LOG_VARIANCE
+    k = 1.0 + rounding * math.exp(-theta[n + px.LOG_VARIANCE])
     slope, bend = 2.0 * k / a, (2.0 * k - 4.0 * k * k) / (a * a)
     for j in range(n):
         block = at[j]
-        for first in (INFORMATION, DAMPING):
+        for first in (px.INFORMATION, px.DAMPING):
             corner, across = block[first + noise, noise], block[first + noise, step]
             block[first + step, 0] += slope * block[first + noise, 0]
             block[first + step, step] += slope * (2.0 * across + slope * corner)
             block[first + noise - 1, step] += slope * block[first + noise, noise - 1]
             block[first + noise, step] += slope * corner
             block[first + noise + 1, step] += slope * block[first + noise + 1, noise]
-        block[INFORMATION + step, step] -= bend * block[SCORE, noise]
-        block[SCORE, step] += slope * block[SCORE, noise]
+        block[px.INFORMATION + step, step] -= bend * block[px.SCORE, noise]
+        block[px.SCORE, step] += slope * block[px.SCORE, noise]
 
 
 @kernel(inline=True, borrows=True)
 def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rounding: float) -> float:
     """Return the variance of rounding with which sigma moves with 1/g; negative where it does not."""
-    noise = theta.size - N_BLOCK + 1 + LOG_VARIANCE
-    if flags[HELD, noise] and not flags[FIXED, noise]:  # at its floor, which moves with 1/g
-        a = theta[noise - LOG_VARIANCE + STEP]
+    noise = theta.size - px.N_BLOCK + 1 + px.LOG_VARIANCE
+    if flags[px.HELD, noise] and not flags[px.FIXED, noise]:  # at its floor, which moves with 1/g
+        a = theta[noise - px.LOG_VARIANCE + px.STEP]
         moves = 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
         if limits.cells:
             moves = LEAST_NOISE_E * a > LEAST_NOISE_DN
@@ -336,20 +310,20 @@ def ascend(
     scratch: Scratch,
 ) -> tuple[int, float, int, int]:
     """Climb, see `climb`; return also where the evaluation at the last theta is, `AT` or `AHEAD`."""
-    trial, step = scratch.small[TRIAL], scratch.small[STEPS]
+    trial, step = scratch.small[px.TRIAL], scratch.small[px.STEPS]
     rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
-    flags, place = scratch.flags, AT
+    flags, place = scratch.flags, px.AT
     keep_inside(theta, limits)
     if not sensible(theta, pixel.longest_step, limits.cells):
         return DEGENERATE, -math.inf, 0, place
-    loglik = evaluate(pixel, theta, DERIVATIVES, scratch, scratch.evaluations[place])
+    loglik = evaluate(pixel, theta, px.DERIVATIVES, scratch, scratch.evaluations[place])
     warm_up = limits.warm_up if goal.first else 0
     only_em = goal.first and limits.only_em
     used, damping, fresh = 1, 0.0, limits.most > 0
     least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
     while used < limits.most:
-        at, ahead = scratch.evaluations[place], scratch.evaluations[AT + AHEAD - place]
-        find_held(theta, at, flags[FIXED], limits, flags[HELD])
+        at, ahead = scratch.evaluations[place], scratch.evaluations[px.AT + px.AHEAD - place]
+        find_held(theta, at, flags[px.FIXED], limits, flags[px.HELD])
         tied = _tie_of(theta, goal, flags, limits, rounding)
         if tied >= 0.0 and fresh:
             tie_noise(theta, at, tied)
@@ -378,7 +352,7 @@ def ascend(
         # a step out of bounds counts, too: damped and not damped in turn it may be refused for ever
         used += 1
         if sensible(trial, pixel.longest_step, limits.cells):
-            risen = evaluate(pixel, trial, DERIVATIVES, scratch, ahead)
+            risen = evaluate(pixel, trial, px.DERIVATIVES, scratch, ahead)
         elif not limits.cells:
             return DEGENERATE, loglik, used - 1, place
         if newton and not risen >= loglik - 1e-11 * abs(loglik):
@@ -390,7 +364,7 @@ def ascend(
             return NOT_CONVERGED, loglik, used, place
         damping = _damping_after(risen - loglik, (2.0 * factor - factor * factor) * rise, rise, share)
         copy(trial, theta)
-        place = AT + AHEAD - place
+        place = px.AT + px.AHEAD - place
         loglik, fresh = risen, True
     return NOT_CONVERGED, loglik, used, place
 
@@ -403,7 +377,7 @@ def climb(
     known: FloatArray,
     theta: FloatArray,
     scratch: Scratch,
-) -> tuple[int, float, int]:
+) -> tuple[int, float]:
     """Climb to the maximum near ``theta``, which is updated in place.
 
     The parameters that stay are in the flags `FIXED` of the scratch; the evaluation at the last theta that
@@ -411,9 +385,10 @@ def climb(
 
     Returns:
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
-        that is trusted), number of evaluations.
+        that is trusted).
     """
     outcome, loglik, used, place = ascend(pixel, evaluate, limits, goal, known, theta, scratch)
-    if place != AT:
-        copy_evaluation(scratch.evaluations[place], scratch.evaluations[AT])
-    return outcome, loglik, used
+    if place != px.AT:
+        copy_evaluation(scratch.evaluations[place], scratch.evaluations[px.AT])
+    scratch.used[0] += used
+    return outcome, loglik

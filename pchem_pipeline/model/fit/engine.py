@@ -18,7 +18,7 @@ from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _VECTOR = np.zeros(1)
-_OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64, numba.types.int64))
+_OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64))
 _FOUND = numba.types.UniTuple(numba.types.int64, 3)
 _LIMITS = Limits(0.0, 0.0, 0, 0, False, False, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, False, False, False)
 
@@ -33,8 +33,9 @@ def _evaluation_arguments() -> tuple[Any, ...]:
     """Return an example of each argument of a likelihood."""
     rows, stack = np.zeros((1, 1)), np.zeros((1, 1, 1))
     pixel = Pixel(stack, rows, stack, stack, 0, 0.0)
-    flags, evaluations = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1))
-    return pixel, _VECTOR, 0, Scratch(rows, rows, rows, rows, stack, rows, rows, flags, evaluations), stack
+    flags, evaluations, used = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1)), np.zeros(1, np.int64)
+    scratch = Scratch(rows, rows, rows, rows, stack, rows, rows, flags, evaluations, used)
+    return pixel, _VECTOR, 0, scratch, stack
 
 
 @functools.cache

@@ -11,8 +11,8 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit import engine, profile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.tile_numba import Histograms
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law
-from pchem_pipeline.model.law.pixel_numba import BIAS, LOG_VARIANCE, N_BLOCK, SATELLITE, STEP
 
 #: Standard errors between the biases that are looked at, and how many there are at most on either side; a
 #: normal law summed in steps of 1.25 has a variance right to 1e-4.
@@ -67,7 +67,7 @@ class Profile:
         start = np.hstack([log_exposure, 1.0 / gain, bias, np.log(variance), satellites[:, 1:]])
         self._fixed = np.zeros(start.shape, np.bool_)
         self._fixed[:, :n] = given.dark
-        self._fixed[:, n + SATELLITE] = ~(satellites[:, 1] > 0.0)
+        self._fixed[:, n + px.SATELLITE] = ~(satellites[:, 1] > 0.0)
         pixels = np.flatnonzero(np.isfinite(parameters).all(axis=1))
         self.theta, self.loglik = np.full(start.shape, np.nan), np.full(len(start), -np.inf)
         self.covariance = np.full((*start.shape, start.shape[1]), np.nan)
@@ -89,22 +89,22 @@ class Profile:
         profile_numba.climb_tile(
             *(self._given, pixels, self._law, self._limits, engine.likelihood(self._limits.cells)),
             *(engine.climb(), self._amplitudes[pixels], fixed, np.broadcast_to(tied, m).copy()),
-            *(found, loglik, covariance, np.empty((m, N_BLOCK))),
+            *(found, loglik, covariance, np.empty((m, px.N_BLOCK))),
         )
         return found, loglik, covariance
 
     def _direction(self, pixels: IndexArray, target: IndexArray) -> FloatArray:
         """Return the change of all coordinates per standard error of a parameter; the last is ``sigma g``."""
         n, m = self._n, np.arange(pixels.size)
-        tied, place = target == n + 3, np.minimum(target, n + LOG_VARIANCE)
+        tied, place = target == n + 3, np.minimum(target, n + px.LOG_VARIANCE)
         best, covariance = self.theta[pixels], self.covariance[pixels]
-        slope = 1.0 / (1.0 + self._rounding * np.exp(-best[:, n + LOG_VARIANCE]))
-        by_step = 2.0 / best[:, n + STEP]
+        slope = 1.0 / (1.0 + self._rounding * np.exp(-best[:, n + px.LOG_VARIANCE]))
+        by_step = 2.0 / best[:, n + px.STEP]
         along = covariance[m, :, place]
-        of_both = slope[:, None] * along - by_step[:, None] * covariance[:, :, n + STEP]
+        of_both = slope[:, None] * along - by_step[:, None] * covariance[:, :, n + px.STEP]
         along = np.where(tied[:, None], of_both, along)
         own = along[m, place]
-        along[m, place] = np.where(tied, slope * own - by_step * along[:, n + STEP], own)
+        along[m, place] = np.where(tied, slope * own - by_step * along[:, n + px.STEP], own)
         along /= np.sqrt(along[m, place])[:, None]
         along[:, :n] *= np.exp(-best[:, :n])  # of log H
         return along
@@ -113,7 +113,7 @@ class Profile:
         self, theta: FloatArray, direction: FloatArray, distance: FloatArray, tied: BoolArray
     ) -> FloatArray:
         """Return theta and so many directions; tied: log (sigma g)^2 stands in the place of v."""
-        place, step = self._n + LOG_VARIANCE, self._n + STEP
+        place, step = self._n + px.LOG_VARIANCE, self._n + px.STEP
         found = theta + distance[:, None] * direction
         wider = np.exp(distance * direction[:, place]) * (found[:, step] / theta[:, step]) ** 2
         variance = (np.exp(theta[:, place]) + self._rounding) * wider - self._rounding
@@ -128,7 +128,7 @@ class Profile:
             likelihood does not fall far enough.
         """
         n = self._n
-        place_of = np.minimum(np.arange(n + 4), n + LOG_VARIANCE)
+        place_of = np.minimum(np.arange(n + 4), n + px.LOG_VARIANCE)
         variance = np.diagonal(self.covariance, axis1=1, axis2=2)[:, place_of]  # 0 of what stays
         pixels, target = (np.repeat(each, 2) for each in np.nonzero(variance > 0.0))
         side = np.arange(pixels.size) % 2
@@ -163,7 +163,7 @@ class Profile:
                 break
         parameters, _ = self._natural(theta)
         values = np.column_stack([parameters, parameters[:, n] * parameters[:, n + 2]])
-        side = np.where(target == n + STEP, 1 - side, side)  # a larger step is a smaller gain
+        side = np.where(target == n + px.STEP, 1 - side, side)  # a larger step is a smaller gain
         ends = np.full((len(self.theta), n + 4, 2), np.nan)
         ends[pixels, target, side] = np.where(reached, values[np.arange(pixels.size), target], np.nan)
         return ends
@@ -180,12 +180,12 @@ class Profile:
         found, heights = np.zeros((count, nodes, n + 3)), np.full((count, nodes), -np.inf)
         across = np.zeros((count, nodes, n + 3, n + 3))
         regular = np.flatnonzero(np.isfinite(self.covariance[:, 0, 0]))
-        direction = self._direction(regular, np.full(regular.size, n + BIAS))
+        direction = self._direction(regular, np.full(regular.size, n + px.BIAS))
         for side in (-1, 0, 1):
             pixels, theta, along = regular, self.theta[regular], direction
             for i in range(1 if side == 0 else _MOST):
                 place = _MOST + side * (i + 1)
-                theta, loglik, covariance = self._climb(pixels, theta + side * _SPACING * along, n + BIAS)
+                theta, loglik, covariance = self._climb(pixels, theta + side * _SPACING * along, n + px.BIAS)
                 fine = np.isfinite(covariance[:, 0, 0])
                 pixels, theta, along = pixels[fine], theta[fine], along[fine]
                 height = loglik[fine] - self.loglik[pixels]
@@ -193,8 +193,8 @@ class Profile:
                 own = covariance[fine, : n + 3, : n + 3]
                 across[pixels, place] = own * slope[:, :, None] * slope[:, None, :]
                 heights[pixels, place] = height
-                walked = np.abs(theta[:, n + BIAS] - self.theta[pixels, n + BIAS])
-                going = ~((walked > reach[pixels] * self.theta[pixels, n + STEP]) & (height < -_DEEPEST))
+                walked = np.abs(theta[:, n + px.BIAS] - self.theta[pixels, n + px.BIAS])
+                going = ~((walked > reach[pixels] * self.theta[pixels, n + px.STEP]) & (height < -_DEEPEST))
                 pixels, theta, along = pixels[going], theta[going], along[going]
                 if pixels.size == 0:
                     break
@@ -228,9 +228,9 @@ class Profile:
     def _natural(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (H_1 ... H_J, g, mu, sigma), and their slopes in (H_1 ... H_J, 1/g, mu, v), (m, J + 3)."""
         n = self._n
-        variance = np.exp(theta[:, n + LOG_VARIANCE])
-        gain, sigma = 1.0 / theta[:, n + STEP], np.sqrt(variance + self._rounding)
+        variance = np.exp(theta[:, n + px.LOG_VARIANCE])
+        gain, sigma = 1.0 / theta[:, n + px.STEP], np.sqrt(variance + self._rounding)
         slope = np.ones((len(theta), n + 3))
-        slope[:, n + STEP], slope[:, n + LOG_VARIANCE] = -(gain**2), 0.5 * variance / sigma
+        slope[:, n + px.STEP], slope[:, n + px.LOG_VARIANCE] = -(gain**2), 0.5 * variance / sigma
         exposure = np.where(self._given.dark, 0.0, np.exp(theta[:, :n]))
-        return np.column_stack([exposure, gain, theta[:, n + BIAS], sigma]), slope
+        return np.column_stack([exposure, gain, theta[:, n + px.BIAS], sigma]), slope

@@ -12,25 +12,9 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, Limits, keep_inside
 from pchem_pipeline.model.fit.tile_numba import Histograms, load_pixel, make_room
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law, resolve
-from pchem_pipeline.model.law.pixel_numba import (
-    AT,
-    BIAS,
-    FIXED,
-    HELD,
-    HERE,
-    INFORMATION,
-    KNOWN,
-    LOG_VARIANCE,
-    N_BLOCK,
-    N_SHARED,
-    OTHER,
-    SCORE,
-    STEP,
-    Pixel,
-    copy,
-    make_scratch,
-)
+from pchem_pipeline.model.law.pixel_numba import Pixel, copy, make_scratch
 
 
 @kernel
@@ -70,40 +54,40 @@ def climb_tile(
             shape (m, N_BLOCK).
     """
     size = theta.shape[1]
-    n, room = size - N_SHARED, make_room(given, law)
+    n, room = size - px.N_SHARED, make_room(given, law)
     scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
-    here, start = scratch.small[HERE], scratch.small[OTHER]
+    here, start = scratch.small[px.HERE], scratch.small[px.OTHER]
     for row in range(chosen.size):
         pixel = load_pixel(given, chosen[row], room)
-        if fixed[row, n + STEP] and fixed[row, n + LOG_VARIANCE]:
-            pixel = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.centre, KNOWN)
+        if fixed[row, n + px.STEP] and fixed[row, n + px.LOG_VARIANCE]:
+            pixel = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.centre, px.KNOWN)
         if limits.cells:
             resolve(law, chosen[row], amplitudes[row], pixel)
         copy(theta[row], here)
-        here[n + BIAS] -= pixel.centre
+        here[n + px.BIAS] -= pixel.centre
         copy(here, start)
         for i in range(size):
-            scratch.flags[FIXED, i] = fixed[row, i]
+            scratch.flags[px.FIXED, i] = fixed[row, i]
         keep_inside(here, limits)
-        allowed = here[n + STEP] > 0.0
+        allowed = here[n + px.STEP] > 0.0
         for i in range(size):
             allowed = allowed and (here[i] == start[i] or not fixed[row, i])
         loglik[row], regular = -math.inf, False
         if allowed:
             goal = Goal(np.bool_(False), -math.inf, -math.inf, math.inf, tied[row])
-            outcome, height, _ = climb(pixel, evaluate, limits, goal, here, here, scratch)
+            outcome, height = climb(pixel, evaluate, limits, goal, here, here, scratch)
             for i in range(size):
                 allowed = allowed and (here[i] == start[i] or tied[row] or not fixed[row, i])
             if allowed and outcome == CONVERGED:
                 loglik[row] = height
-                at, held = scratch.evaluations[AT], scratch.flags[HELD]
+                at, held = scratch.evaluations[px.AT], scratch.flags[px.HELD]
                 regular = invert_arrow(at, here, held, covariance[row])
-                for i in range(N_BLOCK):
-                    curvature[row, i] = at[0, INFORMATION + i, 0] * math.exp(-here[0])
-                curvature[row, 0] += at[0, SCORE, 0] * math.exp(-here[0])
+                for i in range(px.N_BLOCK):
+                    curvature[row, i] = at[0, px.INFORMATION + i, 0] * math.exp(-here[0])
+                curvature[row, 0] += at[0, px.SCORE, 0] * math.exp(-here[0])
                 curvature[row, 0] *= math.exp(-here[0])
         copy(here, theta[row])
-        theta[row, n + BIAS] += pixel.centre
+        theta[row, n + px.BIAS] += pixel.centre
         if not regular:
             for i in range(size):
                 for j in range(size):

@@ -25,33 +25,9 @@ from pchem_pipeline.model.fit.search_numba import (
     next_start,
 )
 from pchem_pipeline.model.fit.starts_numba import keep_start, no_starts
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law, set_peaks
-from pchem_pipeline.model.law.pixel_numba import (
-    AT,
-    BIAS,
-    DAMPING,
-    DARK,
-    DERIVATIVES,
-    FIXED,
-    HEIGHTS,
-    HELD,
-    HERE,
-    INFORMATION,
-    LOG_VARIANCE,
-    MASS,
-    N_BINS,
-    SATELLITE,
-    SCORE,
-    SLOPES,
-    STEP,
-    STEPS,
-    WEIGHT,
-    Histogram,
-    Pixel,
-    Scratch,
-    copy,
-    histogram_of,
-)
+from pchem_pipeline.model.law.pixel_numba import Histogram, Pixel, Scratch, copy, histogram_of
 
 _SCREEN = 0.2  # of the rise asked of free satellites, seen from the fit without them
 #: steps of the other starts in units of that of a Poisson law without noise, third cumulant over variance
@@ -66,29 +42,29 @@ _LEAST_START, _MOST_START = 0.005, 0.5  # weight of the satellites at a start
 
 
 @kernel(borrows=True)
-def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tuple[float, int]:
-    """Climb with the weight of the satellites free; return log-likelihood, or -inf, and evaluations."""
+def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> float:
+    """Climb with the weight of the satellites free; return log-likelihood, or -inf."""
     goal = Goal(np.bool_(True), to_beat, -math.inf, math.inf, np.bool_(False))
-    outcome, loglik, used = climb_on(pixel, tools, goal, theta, theta)
-    return (loglik if outcome == CONVERGED else -math.inf), used
+    outcome, loglik = climb_on(pixel, tools, goal, theta, theta)
+    return loglik if outcome == CONVERGED else -math.inf
 
 
 @kernel(borrows=True)
 def _evaluate_weight(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
     """Evaluate the rise of the log-likelihood with the weight of the satellites: the mass is linear in it."""
-    rise, weight, place = 0.0, theta[theta.size - 1], 1 + SATELLITE
+    rise, weight, place = 0.0, theta[theta.size - 1], 1 + px.SATELLITE
     for j in range(pixel.facts.shape[0]):
-        weights, room, slope, bend = pixel.bins[j, WEIGHT], scratch.cells[j], 0.0, 0.0
-        for i in range(int(pixel.facts[j, N_BINS])):
-            if weights[i] > 0.0 and room[MASS, i] > 0.0:
-                ratio = room[SLOPES + place, i] / room[MASS, i]
+        weights, room, slope, bend = pixel.bins[j, px.WEIGHT], scratch.cells[j], 0.0, 0.0
+        for i in range(int(pixel.facts[j, px.N_BINS])):
+            if weights[i] > 0.0 and room[px.MASS, i] > 0.0:
+                ratio = room[px.SLOPES + place, i] / room[px.MASS, i]
                 factor = 1.0 + weight * ratio
                 rise += weights[i] * math.log(factor)
                 ratio /= factor
                 slope += weights[i] * ratio
                 bend += weights[i] * ratio * ratio
-        out[j, SCORE, place] = slope
-        out[j, INFORMATION + place, place] = out[j, DAMPING + place, place] = bend
+        out[j, px.SCORE, place] = slope
+        out[j, px.INFORMATION + place, place] = out[j, px.DAMPING + place, place] = bend
     return rise
 
 
@@ -99,17 +75,18 @@ def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, 
     Returns the log-likelihood without them, its rise by the weight, and that expected of all parameters.
     """
     scratch, limits, last = tools.scratch, tools.limits, theta.size - 1
-    at, fixed = scratch.evaluations[AT], scratch.flags[FIXED]
+    at, fixed = scratch.evaluations[px.AT], scratch.flags[px.FIXED]
     theta[last] = 0.0
-    without: float = tools.evaluate(pixel, theta, DERIVATIVES, scratch, at)
-    find_held(theta, at, fixed, limits, scratch.flags[HELD])
-    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
+    without: float = tools.evaluate(pixel, theta, px.DERIVATIVES, scratch, at)
+    scratch.used[0] += 1
+    find_held(theta, at, fixed, limits, scratch.flags[px.HELD])
+    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[px.STEPS])
     theta[last] = _LEAST_WEIGHT
     for i in range(last):
         fixed[i] = True
     _, rise, _, _ = ascend(pixel, _evaluate_weight, limits, from_start(), theta, theta, scratch)
     for i in range(last):
-        fixed[i] = i < pixel.facts.shape[0] and pixel.facts[i, DARK] > 0.0
+        fixed[i] = i < pixel.facts.shape[0] and pixel.facts[i, px.DARK] > 0.0
     theta[last] = min(max(theta[last], _LEAST_START), _MOST_START)
     return without, rise, expected
 
@@ -128,11 +105,11 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
     n = pixel.facts.shape[0]
     for j in range(n):
         exposure = math.exp(theta[j]) + direction
-        if pixel.facts[j, DARK] == 0.0:
+        if pixel.facts[j, px.DARK] == 0.0:
             if not exposure > 0.03:
                 return -math.inf
             theta[j] = math.log(exposure)
-    theta[n + BIAS] -= direction * theta[n + STEP]
+    theta[n + px.BIAS] -= direction * theta[n + px.STEP]
     without, rise, _ = _with_weight(pixel, tools, theta)
     return float(without + rise)
 
@@ -156,20 +133,18 @@ def _with_cumulants(
     if not exposure > 0.03 or spread < -_SHORTFALL * exposure:
         return False
     theta[0] = math.log(exposure)
-    theta[1 + STEP] = a
-    theta[1 + BIAS] = histogram.mean - a * (exposure + weight * m1)
-    theta[1 + LOG_VARIANCE] = 2.0 * math.log(_NOISE_E * a)
-    theta[1 + SATELLITE] = weight
+    theta[1 + px.STEP] = a
+    theta[1 + px.BIAS] = histogram.mean - a * (exposure + weight * m1)
+    theta[1 + px.LOG_VARIANCE] = 2.0 * math.log(_NOISE_E * a)
+    theta[1 + px.SATELLITE] = weight
     fine: bool = sensible(theta, math.inf, True)
     return fine
 
 
 @kernel(borrows=True)
-def _from_cumulants(
-    pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray
-) -> tuple[bool, int]:
-    """Fill ``theta`` with the likeliest comb of a histogram's cumulants; return whether and evaluations."""
-    scratch, histogram, used = tools.scratch, histogram_of(pixel, 0), 0
+def _from_cumulants(pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray) -> bool:
+    """Fill ``theta`` with the likeliest comb of a histogram's cumulants; return whether there is one."""
+    scratch, histogram = tools.scratch, histogram_of(pixel, 0)
     third = m1 = m2 = m3 = 0.0
     for i in range(histogram.n_bins):
         third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
@@ -182,22 +157,22 @@ def _from_cumulants(
         m3 += law.pattern[side, 1] * shift * shift * shift
     if abs(m1) < 1e-9 * amplitude:
         m1 = m3 = 0.0
-    no_starts(scratch.small[HEIGHTS])
+    no_starts(scratch.small[px.HEIGHTS])
     for scale in _SCALES:
         a = scale * third / histogram.variance
-        if _with_cumulants(a, third, histogram, (m1, m2, m3), scratch.small[HERE]):
-            used += keep_start(pixel, tools.evaluate, True, scratch)
-    return next_start(scratch, theta), used
+        if _with_cumulants(a, third, histogram, (m1, m2, m3), scratch.small[px.HERE]):
+            keep_start(pixel, tools.evaluate, True, scratch)
+    return bool(next_start(scratch, theta))
 
 
 @kernel
 def _refine(
     amplitude: float, theta: FloatArray, highest: float, pixel: Pixel, law: Law, index: int, tools: Tools
-) -> tuple[float, float, int]:
-    """Climb in the amplitude, too; update ``theta``, return amplitude, e-, log-likelihood and evaluations."""
-    trial = tools.scratch.small[HERE]
+) -> float:
+    """Climb in the amplitude, too, from a maximum; update ``theta`` and return the amplitude, e-."""
+    trial = tools.scratch.small[px.HERE]
     heights = np.empty(2)
-    used, step, target = 0, _FINER, 0.0
+    step, target = _FINER, 0.0
     for attempt in range(_N_REFINED):
         start = amplitude
         for side in range(3):
@@ -212,8 +187,7 @@ def _refine(
             tried = start * math.exp(target)
             set_peaks(law, index, tried, pixel)
             copy(theta, trial)
-            found, count = _climb(pixel, tools, -math.inf, trial)
-            used += count
+            found = _climb(pixel, tools, -math.inf, trial)
             if side < 2:
                 heights[side] = found
             if found > highest:
@@ -223,7 +197,7 @@ def _refine(
             step *= 0.3
         if attempt > 0 and step < 0.02:
             break
-    return amplitude, highest, used
+    return amplitude
 
 
 @kernel
@@ -237,18 +211,15 @@ def search_satellites(
     unsure: bool,
     thorough: bool,
     tools: Tools,
-) -> tuple[float, int]:
+) -> float:
     """Try free satellites of each amplitude; keep the best in ``theta`` where the likelihood rises by enough.
 
     ``unsure``: a start with one electron more is tried, too; one with one less always is. ``thorough``: both
-    are however unlikely, and starts on other combs.
-
-    Returns:
-        The amplitude kept, e-, 0 without one; evaluations.
+    are however unlikely, and starts on other combs. Return the amplitude kept, e-, 0 without one.
     """
     scratch, weight, best = tools.scratch, theta.size - 1, theta.copy()
-    trial, fixed = scratch.small[HERE], scratch.flags[FIXED]
-    kept, highest, used = 0.0, loglik + tools.limits.satellite_rise, 0
+    trial, fixed = scratch.small[px.HERE], scratch.flags[px.FIXED]
+    kept, highest = 0.0, loglik + tools.limits.satellite_rise
     # a satellite above the others is no one's peak of no electron: only an unsure fit may be below
     likely = loglik - CLEAR_GAP if not thorough else -math.inf
     fixed[weight] = False
@@ -256,7 +227,7 @@ def search_satellites(
         set_peaks(law, index, amplitude, pixel)
         for attempt in range(_N_ATTEMPTS):
             copy(theta, trial)
-            usable, count = False, 1
+            usable = False
             if attempt == 0:
                 usable = _from_fit(pixel, tools, trial)
             elif attempt == 1 and (unsure or thorough):
@@ -264,22 +235,18 @@ def search_satellites(
             elif attempt == 2:
                 usable = _beside(-1.0, pixel, tools, trial) > likely
             elif attempt == 3 and thorough and pixel.facts.shape[0] == 1:
-                usable, count = _from_cumulants(pixel, law, amplitude, tools, trial)
-            used += count
+                usable = _from_cumulants(pixel, law, amplitude, tools, trial)
             if not usable:
                 continue
-            found, count = _climb(pixel, tools, -math.inf if attempt == 0 else highest, trial)
-            used += count
+            found = _climb(pixel, tools, -math.inf if attempt == 0 else highest, trial)
             if thorough and found > highest - CLEAR_GAP:
-                found, _, count = climb_neighbours(pixel, tools, trial, found)
-                used += count
+                found, _ = climb_neighbours(pixel, tools, trial, found)
             if found > highest:
                 kept, highest = amplitude, found
                 copy(trial, best)
     if kept > 0.0:
         copy(best, theta)
-        kept, highest, count = _refine(kept, theta, highest, pixel, law, index, tools)
-        used += count
+        kept = _refine(kept, theta, highest, pixel, law, index, tools)
     fixed[weight] = kept == 0.0
     set_peaks(law, index, kept, pixel)
-    return kept, used
+    return kept

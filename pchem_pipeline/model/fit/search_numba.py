@@ -16,37 +16,10 @@ from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, DEGENERATE, Goal, Limits, find_held, same_place
 from pchem_pipeline.model.fit.starts_numba import N_ATTEMPTS, fill_starts, keep_start, longer_steps, no_starts
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.density_numba import LOG_2PI
-from pchem_pipeline.model.law.pixel_numba import (
-    AT,
-    AT_BEST,
-    BIAS,
-    DARK,
-    EXPECTATIONS,
-    EXPECTED,
-    FIRST,
-    FIXED,
-    HEIGHTS,
-    HELD,
-    HERE,
-    KEPT_STARTS,
-    LOG_VARIANCE,
-    LOGLIK_ALONE,
-    MEAN,
-    N_BINS,
-    N_FRAMES,
-    N_KEPT,
-    OCCUPIED,
-    OTHER,
-    SATELLITE,
-    STEP,
-    VARIANCE,
-    WEIGHT,
-    Pixel,
-    Scratch,
-    copy,
-)
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch, copy
 
 NO_DATA, TOO_FEW_BINS = int(FitStatus.NO_DATA), int(FitStatus.TOO_FEW_BINS)
 FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED = int(FitStatus.NOT_CONVERGED), int(FitStatus.GAIN_NOT_IDENTIFIED)
@@ -109,19 +82,16 @@ class Found(NamedTuple):
 
     loglik: float  # log-likelihood of the best maximum, -inf without one
     runner_up: float  # that of the next one
-    used: int  # evaluations
     degenerate: bool | np.bool_  # a climb ran towards one Gaussian
 
 
 @kernel(borrows=True)
 def climb_on(
     pixel: Pixel, tools: Tools, goal: Goal, known: FloatArray, theta: FloatArray
-) -> tuple[int, float, int]:
+) -> tuple[int, float]:
     """Climb, see :func:`.climb_numba.climb`."""
-    outcome, loglik, used = tools.climb(
-        pixel, tools.evaluate, tools.limits, goal, known, theta, tools.scratch
-    )
-    return outcome, loglik, used
+    outcome, loglik = tools.climb(pixel, tools.evaluate, tools.limits, goal, known, theta, tools.scratch)
+    return outcome, loglik
 
 
 @kernel(borrows=True)
@@ -141,9 +111,9 @@ def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
     """Return the nats that peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring: ``N r^2``."""
     n, frames = pixel.facts.shape[0], 0.0
     for j in range(n):
-        if pixel.facts[j, DARK] == 0.0:
-            frames += pixel.facts[j, N_FRAMES]
-    noise2 = math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
+        if pixel.facts[j, px.DARK] == 0.0:
+            frames += pixel.facts[j, px.N_FRAMES]
+    noise2 = math.exp(best[n + px.LOG_VARIANCE]) / best[n + px.STEP] ** 2
     return frames * math.exp(-4.0 * math.pi**2 * noise2)
 
 
@@ -152,7 +122,7 @@ def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
     """Return the largest exposure of a pixel's samples, e-."""
     most = 0.0
     for j in range(pixel.facts.shape[0]):
-        if pixel.facts[j, DARK] == 0.0:
+        if pixel.facts[j, px.DARK] == 0.0:
             most = max(most, math.exp(theta[j]))
     return most
 
@@ -165,10 +135,10 @@ def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     """
     n = pixel.facts.shape[0]
     if n == 1:
-        return 4 if cells and not theta[n + STEP] > FEW_STEP else 2
-    frames = pixel.facts[0, N_FRAMES]
+        return 4 if cells and not theta[n + px.STEP] > FEW_STEP else 2
+    frames = pixel.facts[0, px.N_FRAMES]
     for j in range(n):
-        frames = min(frames, pixel.facts[j, N_FRAMES])
+        frames = min(frames, pixel.facts[j, px.N_FRAMES])
     reach = 3.0 * math.sqrt(2.0 / frames) * _most_electrons(pixel, theta)
     return 4 + 2 * int(min(reach, _MOST_STEPS))
 
@@ -188,33 +158,29 @@ def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> 
     if which < 2:
         for j in range(n):
             out[j] = math.log(max(math.exp(theta[j]) + change, 0.01))
-        out[n + BIAS] -= change * theta[n + STEP]
+        out[n + px.BIAS] -= change * theta[n + px.STEP]
         return True
     factor = (most + change) / most
     for j in range(n):
         out[j] += math.log(factor)
-    out[n + STEP] /= factor
+    out[n + px.STEP] /= factor
     return bool(most > _LEAST_BRIGHT)
 
 
 @kernel(borrows=True)
-def climb_neighbours(
-    pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: float
-) -> tuple[float, float, int]:
+def climb_neighbours(pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: float) -> tuple[float, float]:
     """Move ``best`` to a neighbour while one is more likely.
 
-    Returns:
-        Log-likelihood of the best, that of the best other one (-inf without one), evaluations.
+    Return its log-likelihood, and that of the best other one, -inf without one.
     """
-    trial, runner_up = tools.scratch.small[OTHER], -math.inf
-    came_from, used, moves, which = -1, 0, 0, 0
+    trial, runner_up = tools.scratch.small[px.OTHER], -math.inf
+    came_from, moves, which = -1, 0, 0
     while which < _count_neighbours(pixel, tools.limits.cells, best):
         if which == came_from or not _neighbour(which, pixel, best, trial):
             which += 1
             continue
         goal = goal_beside(False, best_loglik, runner_up)
-        outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
-        used += count
+        outcome, loglik = climb_on(pixel, tools, goal, best, trial)
         higher = outcome == CONVERGED and loglik > best_loglik
         if outcome == DEGENERATE or same_place(best, trial, tools.limits.cells):
             if higher:
@@ -231,7 +197,7 @@ def climb_neighbours(
         else:
             runner_up = max(runner_up, loglik)
             which += 1
-    return best_loglik, runner_up, used
+    return best_loglik, runner_up
 
 
 @kernel(borrows=True)
@@ -239,8 +205,8 @@ def loglik_without_gain(pixel: Pixel) -> float:
     """Return the log-likelihood of Gaussians of one width, each at the mean of its sample: g to infinity."""
     n = square = 0.0
     for j in range(pixel.facts.shape[0]):
-        n += pixel.facts[j, N_FRAMES]
-        square += pixel.facts[j, N_FRAMES] * pixel.facts[j, VARIANCE]
+        n += pixel.facts[j, px.N_FRAMES]
+        square += pixel.facts[j, px.N_FRAMES] * pixel.facts[j, px.VARIANCE]
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(square / n, QUANTISATION_VARIANCE)))
 
 
@@ -252,11 +218,11 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
     of ``2 exp(-2 pi^2 0.8^2) = 7e-6``: ``H / (H + 0.8^2)^(3/2)`` is the skewness, or as near to it as that
     read noise lets it.
     """
-    facts, weights, trial = pixel.facts[0], pixel.bins[0, WEIGHT], scratch.small[HERE]
+    facts, weights, trial = pixel.facts[0], pixel.bins[0, px.WEIGHT], scratch.small[px.HERE]
     third = 0.0
-    for i in range(int(facts[N_BINS])):
-        third += weights[i] * (facts[FIRST] + i - facts[MEAN]) ** 3
-    skewness = max(third / facts[N_FRAMES] / facts[VARIANCE] ** 1.5, _LEAST_SKEWNESS)
+    for i in range(int(facts[px.N_BINS])):
+        third += weights[i] * (facts[px.FIRST] + i - facts[px.MEAN]) ** 3
+    skewness = max(third / facts[px.N_FRAMES] / facts[px.VARIANCE] ** 1.5, _LEAST_SKEWNESS)
     low, high = 2.0 * _BLURRED2, 4.0 / skewness**2 + 10.0
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
@@ -264,11 +230,12 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
             low = middle
         else:
             high = middle
-    a = math.sqrt(facts[VARIANCE] / (low + _BLURRED2))
+    a = math.sqrt(facts[px.VARIANCE] / (low + _BLURRED2))
     rounding = QUANTISATION_VARIANCE if cells else 0.0
-    trial[0], trial[1 + STEP], trial[1 + BIAS] = math.log(low), a, facts[MEAN] - low * a
-    trial[1 + LOG_VARIANCE], trial[1 + SATELLITE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01)), 0.0
-    loglik: float = evaluate(pixel, trial, LOGLIK_ALONE, scratch, scratch.evaluations[AT])
+    trial[0], trial[1 + px.STEP], trial[1 + px.BIAS] = math.log(low), a, facts[px.MEAN] - low * a
+    trial[1 + px.LOG_VARIANCE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01))
+    trial[1 + px.SATELLITE] = 0.0
+    loglik: float = evaluate(pixel, trial, px.LOGLIK_ALONE, scratch, scratch.evaluations[px.AT])
     return loglik
 
 
@@ -281,9 +248,9 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     n = pixel.facts.shape[0]
     most = 0.0
     for j in range(n):
-        if pixel.facts[j, DARK] == 0.0:
-            most = max(most, pixel.facts[j, N_FRAMES])
-    noise2 = math.exp(theta[n + LOG_VARIANCE]) / theta[n + STEP] ** 2
+        if pixel.facts[j, px.DARK] == 0.0:
+            most = max(most, pixel.facts[j, px.N_FRAMES])
+    noise2 = math.exp(theta[n + px.LOG_VARIANCE]) / theta[n + px.STEP] ** 2
     return math.sqrt(most) * math.exp(-2.0 * math.pi**2 * noise2)
 
 
@@ -368,11 +335,11 @@ def goodness(pixel: Pixel) -> tuple[float, int]:
     chi2, freedom = 0.0, 1 - FITTED_PARAMETERS
     for j in range(pixel.facts.shape[0]):
         bins, facts = pixel.bins[j], pixel.facts[j]
-        own, degrees = pearson(bins[WEIGHT], bins[EXPECTED], int(facts[N_BINS]), facts[N_FRAMES])
+        own, degrees = pearson(bins[px.WEIGHT], bins[px.EXPECTED], int(facts[px.N_BINS]), facts[px.N_FRAMES])
         if degrees > 0:
             chi2 += own
             freedom += degrees + FITTED_PARAMETERS
-            if facts[DARK] == 0.0:
+            if facts[px.DARK] == 0.0:
                 freedom -= 1
     if freedom <= 0:
         return math.nan, 0
@@ -385,9 +352,9 @@ def outlying(pixel: Pixel, floor: float) -> float:
     found = 0.0
     for j in range(pixel.facts.shape[0]):
         bins = pixel.bins[j]
-        for i in range(int(pixel.facts[j, N_BINS])):
-            if bins[EXPECTED, i] < floor:
-                found += bins[WEIGHT, i]
+        for i in range(int(pixel.facts[j, px.N_BINS])):
+            if bins[px.EXPECTED, i] < floor:
+                found += bins[px.WEIGHT, i]
     return found
 
 
@@ -395,7 +362,8 @@ def outlying(pixel: Pixel, floor: float) -> float:
 def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> float:
     """Evaluate at a maximum, into `AT_BEST`; fill goodness of fit and outliers; return the log-likelihood."""
     scratch = tools.scratch
-    loglik: float = tools.evaluate(pixel, theta, EXPECTATIONS, scratch, scratch.evaluations[AT_BEST])
+    loglik: float = tools.evaluate(pixel, theta, px.EXPECTATIONS, scratch, scratch.evaluations[px.AT_BEST])
+    scratch.used[0] += 1
     out[OUTLYING] = outlying(pixel, tools.limits.floor)
     out[CHI2], freedom = goodness(pixel)
     out[DEGREES] = float(freedom)
@@ -426,10 +394,10 @@ def judge(
     runner-up; ``of_gain``: one that is near has another gain.
     """
     n, status = pixel.facts.shape[0], 0
-    sigma, a = math.exp(0.5 * best[n + LOG_VARIANCE]), best[n + STEP]
+    sigma, a = math.exp(0.5 * best[n + px.LOG_VARIANCE]), best[n + px.STEP]
     at_bound = True
     for j in range(n):
-        at_bound = at_bound and (pixel.facts[j, DARK] > 0.0 or best[j] <= limits.bound + 1e-9)
+        at_bound = at_bound and (pixel.facts[j, px.DARK] > 0.0 or best[j] <= limits.bound + 1e-9)
     if above_null < limits.gap:
         status |= GAIN_NOT_IDENTIFIED
     if gap < limits.gap:
@@ -445,7 +413,7 @@ def judge(
     if n > 1 and limits.cells and sigma < _COARSE_NOISE and 1.0 / a > 0.5 - NEAR_TWO:
         status |= GAIN_AMBIGUOUS  # combs with the same codes are looked for in single samples only
     if n == 1:
-        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES):
+        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, px.OCCUPIED] < _FEWEST_CODES):
             status |= GAIN_AMBIGUOUS
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)
@@ -461,7 +429,7 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     An electron more or fewer hardly moves the gain where peaks are resolved, which then bring many nats by
     themselves. Any other rival has a gain of its own.
     """
-    least, highest, trial = loglik - tools.limits.gap, -math.inf, tools.scratch.small[OTHER]
+    least, highest, trial = loglik - tools.limits.gap, -math.inf, tools.scratch.small[px.OTHER]
     if pixel.facts.shape[0] > 1 or not runner_up > least:
         return False
     blurred = loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
@@ -469,10 +437,10 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
         return True
     for which in range(2):
         if _neighbour(which, pixel, best, trial):
-            outcome, height, _ = climb_on(pixel, tools, from_start(), best, trial)
+            outcome, height = climb_on(pixel, tools, from_start(), best, trial)
             if outcome == CONVERGED and height > least:
                 highest = max(highest, height)
-                if abs(trial[1 + STEP] - best[1 + STEP]) > _SAME_GAIN * best[1 + STEP]:
+                if abs(trial[1 + px.STEP] - best[1 + px.STEP]) > _SAME_GAIN * best[1 + px.STEP]:
                     return True
     return bool(runner_up > highest + _SAME_RIVAL)
 
@@ -480,14 +448,14 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
 @kernel(borrows=True)
 def next_start(scratch: Scratch, theta: FloatArray) -> bool:
     """Take the highest of the starts; False where none is left."""
-    heights, which = scratch.small[HEIGHTS], 0
-    for i in range(1, N_KEPT):
+    heights, which = scratch.small[px.HEIGHTS], 0
+    for i in range(1, px.N_KEPT):
         if heights[i] > heights[which]:
             which = i
     if heights[which] == -math.inf:
         return False
     heights[which] = -math.inf
-    copy(scratch.small[KEPT_STARTS + which], theta)
+    copy(scratch.small[px.KEPT_STARTS + which], theta)
     return True
 
 
@@ -501,16 +469,21 @@ def fall_and_parabola(
     with the parameter fixed. The fall is infinite where nothing is to be known.
     """
     scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
-    at, held, trial, change = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE], 0.0
-    find_held(best, at, scratch.flags[FIXED], tools.limits, held)
+    at, held, trial, change = (
+        scratch.evaluations[px.AT_BEST],
+        scratch.flags[px.HELD],
+        scratch.small[px.HERE],
+        0.0,
+    )
+    find_held(best, at, scratch.flags[px.FIXED], tools.limits, held)
     if not invert_arrow(at, best, held, covariance):
         return math.inf, 0.0
-    scratch.flags[FIXED, which] = True
+    scratch.flags[px.FIXED, which] = True
     for _ in range(2):
         if next_start(scratch, trial):
             change = trial[which] - best[which]
             top = max(top, climb_on(pixel, tools, from_start(), trial, trial)[1])
-    scratch.flags[FIXED, which] = False
+    scratch.flags[px.FIXED, which] = False
     return loglik - top, 0.5 * change**2 / covariance[which, which]
 
 
@@ -521,18 +494,18 @@ def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     They then exclude read noises that the likelihood does not. One without peaks, 0.8 e-, has the same
     variances with a bias and exposures that are off by the difference of the squares, e-.
     """
-    n, trial = pixel.facts.shape[0], tools.scratch.small[HERE]
-    more = _BLURRED2 - math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
+    n, trial = pixel.facts.shape[0], tools.scratch.small[px.HERE]
+    more = _BLURRED2 - math.exp(best[n + px.LOG_VARIANCE]) / best[n + px.STEP] ** 2
     if more < 0.0 or nats_of_peaks(pixel, best) < _UNSEEN:
         return False
     copy(best, trial)
     for j in range(n):
         trial[j] = math.log(math.exp(best[j]) + more)
-    trial[n + BIAS] -= more * best[n + STEP]
-    trial[n + LOG_VARIANCE] = math.log(_BLURRED2 * best[n + STEP] ** 2)
-    no_starts(tools.scratch.small[HEIGHTS])
+    trial[n + px.BIAS] -= more * best[n + px.STEP]
+    trial[n + px.LOG_VARIANCE] = math.log(_BLURRED2 * best[n + px.STEP] ** 2)
+    no_starts(tools.scratch.small[px.HEIGHTS])
     keep_start(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
-    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, n + LOG_VARIANCE)
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, n + px.LOG_VARIANCE)
     least = tools.limits.gap
     return bool(fall < 2.0 * least and parabola > 2.0 * max(fall, least))
 
@@ -549,20 +522,18 @@ def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -
 @kernel(borrows=True)
 def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray) -> Found:
     """Examine a new best maximum and, unless the fit rules them out, its neighbours; keep the likeliest."""
-    n, loglik, runner_up, used = pixel.facts.shape[0], found.loglik, found.runner_up, found.used + 1
+    n, loglik, runner_up = pixel.facts.shape[0], found.loglik, found.runner_up
     at_best = examine(pixel, tools, best, out)
     if n == 1 and not tools.limits.cells:
         good, _ = settled(pixel, best, clear, math.inf, out)
-        expected = expected_gap(pixel.facts[0, N_FRAMES], best)
+        expected = expected_gap(pixel.facts[0, px.N_FRAMES], best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
-        if good and out[DEGREES] > 0.0 and expected > sure and best[n + STEP] > _FINE_STEP:
-            return Found(at_best, max(runner_up, at_best - expected), used, found.degenerate)
-    higher, beside, count = climb_neighbours(pixel, tools, best, loglik)
-    used += count
+        if good and out[DEGREES] > 0.0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
+            return Found(at_best, max(runner_up, at_best - expected), found.degenerate)
+    higher, beside = climb_neighbours(pixel, tools, best, loglik)
     if higher > loglik:
         at_best = examine(pixel, tools, best, out)
-        used += 1
-    return Found(at_best, max(beside, runner_up), used, found.degenerate)
+    return Found(at_best, max(beside, runner_up), found.degenerate)
 
 
 @kernel(borrows=True)
@@ -577,33 +548,26 @@ def _climb_start(
 ) -> Found:
     """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
-    known, goal = best[n + STEP] > 0.0, from_start()
+    known, goal = best[n + px.STEP] > 0.0, from_start()
     # of several samples, and of cells, one comb may have two maxima
     if known and n == 1 and not cells:
         goal = goal_beside(True, found.loglik, found.runner_up)
-    outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
-    used = found.used + count
+    outcome, loglik = climb_on(pixel, tools, goal, best, trial)
     if outcome == DEGENERATE:
-        return Found(found.loglik, found.runner_up, used, np.bool_(True))
+        return Found(found.loglik, found.runner_up, np.bool_(True))
     same = known and same_place(best, trial, cells)
     least = found.loglik + _SAME_COMB if same and not cells else found.loglik
     if outcome != CONVERGED or loglik <= least:
         # where a climb did not arrive, a higher value is none of the density's likelihood
         no_rival = same or (outcome != CONVERGED and loglik > found.loglik and not cells)
         runner_up = found.runner_up if no_rival else max(found.runner_up, loglik)
-        return Found(found.loglik, runner_up, used, found.degenerate)
+        return Found(found.loglik, runner_up, found.degenerate)
     runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
     copy(trial, best)
     if same and cells:  # its neighbours are known
-        return Found(examine(pixel, tools, best, out), runner_up, used + 1, found.degenerate)
-    weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, used, found.degenerate), best, out)
+        return Found(examine(pixel, tools, best, out), runner_up, found.degenerate)
+    weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, found.degenerate), best, out)
     return weighed
-
-
-@kernel(borrows=True)
-def plus(found: Found, count: int) -> Found:
-    """Count evaluations."""
-    return Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
 
 
 @kernel(borrows=True)
@@ -611,7 +575,7 @@ def climb_starts(
     pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
 ) -> Found:
     """Climb from the starts, the highest first; a higher maximum takes the place of ``best``."""
-    trial = tools.scratch.small[HERE]
+    trial = tools.scratch.small[px.HERE]
     while next_start(tools.scratch, trial):
         found = _climb_start(pixel, tools, clear, found, trial, best, out)
     return found
@@ -620,14 +584,14 @@ def climb_starts(
 @kernel(borrows=True)
 def _stay_near(
     pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
-) -> tuple[bool, float, int]:
-    """Climb from what is known; return whether that fits well, log-likelihood and evaluations."""
+) -> tuple[bool, float]:
+    """Climb from what is known; return whether that fits well, and its log-likelihood."""
     copy(task.near, trial)
-    outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
+    outcome, loglik = climb_on(pixel, tools, from_start(), trial, trial)
     if outcome != CONVERGED:
-        return False, loglik, used
+        return False, loglik
     examine(pixel, tools, trial, out)
-    return score_of(out) < SUSPICIOUS, loglik, used
+    return score_of(out) < SUSPICIOUS, loglik
 
 
 def search_density(
@@ -645,42 +609,46 @@ def search_density(
     Returns:
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
-    n, trial, limits = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits
-    heights = tools.scratch.small[HEIGHTS]
-    null, used = loglik_without_gain(pixel), 0
-    best[n + STEP] = 0.0
-    if task.near[n + STEP] > 0.0:
-        fits, loglik, used = _stay_near(pixel, tools, task, trial, out)
+    n, trial, limits, used = (
+        pixel.facts.shape[0],
+        tools.scratch.small[px.HERE],
+        tools.limits,
+        tools.scratch.used,
+    )
+    heights, null = tools.scratch.small[px.HEIGHTS], loglik_without_gain(pixel)
+    best[n + px.STEP] = 0.0
+    if task.near[n + px.STEP] > 0.0:
+        fits, loglik = _stay_near(pixel, tools, task, trial, out)
         if fits:
             copy(trial, best)
             out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
             word = judge(pixel, limits, best, loglik - null, math.inf, math.inf, False)
-            return word, used + 1, int(out[DEGREES])
-    found = Found(-math.inf, -math.inf, used, np.bool_(False))
+            return word, used[0], int(out[DEGREES])
+    found = Found(-math.inf, -math.inf, np.bool_(False))
     for attempt in range(N_ATTEMPTS):
-        clear, count = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
+        clear = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
         before = found.loglik
         if clear and attempt == 0:
             most = -math.inf
-            for i in range(N_KEPT):  # the highest is kept
+            for i in range(px.N_KEPT):  # the highest is kept
                 most = max(most, heights[i])
-            for i in range(N_KEPT):
+            for i in range(px.N_KEPT):
                 heights[i] = heights[i] if heights[i] == most else -math.inf
-        found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
-        if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
+        found = climb_starts(pixel, tools, clear, found, best, out)
+        if (n > 1 or attempt == 0) and best[n + px.STEP] > 0.0:
             poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP
-            count = longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
-            found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
+            longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
+            found = climb_starts(pixel, tools, clear, found, best, out)
         if found.loglik > before and not settled(pixel, best, clear, found.loglik - null, out)[1]:
             break
         if limits.quick and found.loglik - null > limits.gap:
             break
-    if not best[n + STEP] > 0.0:
-        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, found.used, 0
-    out[LOG_LIKELIHOOD] = found.loglik
+    if not best[n + px.STEP] > 0.0:
+        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, used[0], 0
+    out[LOG_LIKELIHOOD], count = found.loglik, used[0]
     blurred = above_blurred(pixel, tools, best, found.loglik)
     out[GAP] = min(found.loglik - max(found.runner_up, null), blurred)
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.runner_up)
     gap = found.loglik - found.runner_up
     word = judge(pixel, limits, best, found.loglik - null, blurred, gap, of_gain)
-    return word, found.used, int(out[DEGREES])
+    return word, count, int(out[DEGREES])

@@ -21,31 +21,8 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MIN_STEP, min_log_variance, same_place, sensible
-from pchem_pipeline.model.law.pixel_numba import (
-    AT,
-    BIAS,
-    CENTRE,
-    DARK,
-    HEIGHTS,
-    HERE,
-    KEPT_STARTS,
-    LOG_VARIANCE,
-    LOGLIK_ALONE,
-    MEAN,
-    N_FRAMES,
-    N_KEPT,
-    OCCUPIED,
-    OTHER,
-    SATELLITE,
-    SCANNED,
-    STEP,
-    VARIANCE,
-    Histogram,
-    Pixel,
-    Scratch,
-    copy,
-    histogram_of,
-)
+from pchem_pipeline.model.law import pixel_numba as px
+from pchem_pipeline.model.law.pixel_numba import Histogram, Pixel, Scratch, copy, histogram_of
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a satellite
 N_FREQUENCIES = 48  # up to 4.8/sd, the satellite of H = 22
@@ -264,47 +241,45 @@ def start_regression(
 
 
 @kernel(borrows=True)
-def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Scratch) -> int:
-    """Put combs of a step, a few DN, among the starts of a single sample; return the evaluations.
+def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Scratch) -> None:
+    """Put combs of a step, a few DN, among the starts of a single sample.
 
     Some read noises are tried, and exposures, so many to either side of the one that has the variance right.
     """
-    histogram, trial, used = histogram_of(pixel, 0), scratch.small[HERE], 0
-    trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
+    histogram, trial = histogram_of(pixel, 0), scratch.small[px.HERE]
+    trial[1 + px.STEP], trial[1 + px.SATELLITE] = a, 0.0
     for noise in _FEW_NOISES:
         middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
-        trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, True))
+        trial[1 + px.LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, True))
         for place in range(-around, around + 1):
             exposure = middle + 0.2 * place
             if exposure > 1e-3:
-                trial[0], trial[1 + BIAS] = math.log(exposure), histogram.mean - exposure * a
-                used += keep_start(pixel, evaluate, True, scratch)
-    return used
+                trial[0], trial[1 + px.BIAS] = math.log(exposure), histogram.mean - exposure * a
+                keep_start(pixel, evaluate, True, scratch)
 
 
 @kernel(borrows=True)
 def _keep_lobe(
     pixel: Pixel, evaluate: Any, cells: bool, a: float, lobe: tuple[float, float], scratch: Scratch
-) -> int:
-    """Put the comb of a step among the starts; return the evaluations.
+) -> None:
+    """Put the comb of a step among the starts.
 
     Of few DN per electron and a low H other frequencies add to the lobe; there some read noises are tried.
     """
-    histogram, trial = histogram_of(pixel, 0), scratch.small[HERE]
-    trial[1 + SATELLITE] = 0.0
+    histogram, trial = histogram_of(pixel, 0), scratch.small[px.HERE]
+    trial[1 + px.SATELLITE] = 0.0
     _on_lobe(histogram, a, math.inf, lobe, trial)
     if cells:
-        analog = max(math.exp(trial[1 + LOG_VARIANCE]) - QUANTISATION_VARIANCE, 1e-6)
-        trial[1 + LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
-    used: int = keep_start(pixel, evaluate, cells, scratch)
+        analog = max(math.exp(trial[1 + px.LOG_VARIANCE]) - QUANTISATION_VARIANCE, 1e-6)
+        trial[1 + px.LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
+    keep_start(pixel, evaluate, cells, scratch)
     if cells and a < FEW_STEP and trial[0] < _DIM:
-        used += _keep_noises(pixel, evaluate, a, 0, scratch)
-    return used
+        _keep_noises(pixel, evaluate, a, 0, scratch)
 
 
 @kernel(borrows=True)
-def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
-    """Put the likeliest combs of any step among the starts of a single sample; return the evaluations.
+def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> None:
+    """Put the likeliest combs of any step among the starts of a single sample.
 
     ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H
     is: modulus and phase give s and mu, mean and variance H. A step of more than the range of the sample
@@ -312,9 +287,9 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     closer than the likelihood's maxima. Past the central lobe few are tried of those that stay in the noise,
     ``3 / sqrt(N)``.
     """
-    histogram, work, used = histogram_of(pixel, 0), scratch.rows, 0
-    no_starts(scratch.small[HEIGHTS])
-    first, sd = work.shape[1] - SCANNED, math.sqrt(histogram.variance)
+    histogram, work = histogram_of(pixel, 0), scratch.rows
+    no_starts(scratch.small[px.HEIGHTS])
+    first, sd = work.shape[1] - px.SCANNED, math.sqrt(histogram.variance)
     highest = min(max(_SCAN_END / sd, 1.0 / FEW_STEP), 1.0 / (LEAST_STEP if cells else MIN_STEP))
     end, frequency = first, 1.0 / (histogram.n_bins + 1.0)
     while frequency < highest and end < work.shape[1] - _SIDE_BY_SIDE * SIMD_WIDTH:
@@ -336,52 +311,47 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
         central, clear = frequency * sd < _CENTRAL_LOBE, lobe[0] > _CLEAR * math.sqrt(histogram.n)
         if central or clear or frequency > _UNRESOLVED * last:
             last = frequency
-            used += _keep_lobe(pixel, evaluate, cells, 1.0 / frequency, lobe, scratch)
-    return used
+            _keep_lobe(pixel, evaluate, cells, 1.0 / frequency, lobe, scratch)
 
 
 @kernel(borrows=True)
 def no_starts(heights: FloatArray) -> None:
     """Forget all starts."""
-    for i in range(N_KEPT):
+    for i in range(px.N_KEPT):
         heights[i] = -math.inf
 
 
 @kernel(borrows=True)
 def _keep_rescaled(
     pixel: Pixel, evaluate: Any, cells: bool, best: FloatArray, factor: float, scratch: Scratch
-) -> int:
+) -> None:
     """Put a maximum among the starts with a longer step and the same means, bias and read noise in DN."""
-    n, trial = pixel.facts.shape[0], scratch.small[HERE]
+    n, trial = pixel.facts.shape[0], scratch.small[px.HERE]
     copy(best, trial)
-    trial[n + STEP] *= factor
-    trial[n + LOG_VARIANCE] = max(trial[n + LOG_VARIANCE], min_log_variance(trial[n + STEP], cells))
+    trial[n + px.STEP] *= factor
+    trial[n + px.LOG_VARIANCE] = max(trial[n + px.LOG_VARIANCE], min_log_variance(trial[n + px.STEP], cells))
     for j in range(n):
         trial[j] -= math.log(factor)
-    used: int = keep_start(pixel, evaluate, cells, scratch)
-    return used
+    keep_start(pixel, evaluate, cells, scratch)
 
 
 @kernel(borrows=True)
-def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratch) -> int:
-    """Put the comb of frequency ``1 - 1/a``, which whole numbers show at 1/a, among the starts; count."""
-    no_starts(scratch.small[HEIGHTS])
+def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratch) -> None:
+    """Put the comb of frequency ``1 - 1/a``, which whole numbers show at 1/a, among the starts."""
+    no_starts(scratch.small[px.HEIGHTS])
     n, cells = pixel.facts.shape[0], True
-    a = 1.0 / (1.0 - 1.0 / best[n + STEP])
+    a = 1.0 / (1.0 - 1.0 / best[n + px.STEP])
     if n > 1:
-        rescaled: int = _keep_rescaled(pixel, evaluate, cells, best, a / best[n + STEP], scratch)
-        return rescaled
-    lobe = ecf_at(histogram_of(pixel, 0), 1.0 / a)
-    used: int = _keep_lobe(pixel, evaluate, cells, a, lobe, scratch)
-    return used
+        _keep_rescaled(pixel, evaluate, cells, best, a / best[n + px.STEP], scratch)
+    else:
+        _keep_lobe(pixel, evaluate, cells, a, ecf_at(histogram_of(pixel, 0), 1.0 / a), scratch)
 
 
 @kernel(borrows=True)
-def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> int:
+def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> None:
     """Put the likeliest combs of a few DN per electron, of one step, among the starts; see `_keep_noises`."""
-    no_starts(scratch.small[HEIGHTS])
-    used: int = _keep_noises(pixel, evaluate, a, 2, scratch)
-    return used
+    no_starts(scratch.small[px.HEIGHTS])
+    _keep_noises(pixel, evaluate, a, 2, scratch)
 
 
 @kernel(borrows=True)
@@ -400,33 +370,32 @@ def _holds_one(histogram: Histogram, theta: FloatArray) -> bool:
 @kernel(borrows=True)
 def longer_steps(
     pixel: Pixel, evaluate: Any, poor: bool, best: FloatArray, least: float, scratch: Scratch
-) -> int:
-    """Put combs of longer steps than a maximum's among the starts; return the evaluations.
+) -> None:
+    """Put combs of longer steps than a maximum's among the starts.
 
     Where H and read noise are low, the comb of half the step fits them with no sample at each second peak,
     unless the peak of one electron is there. Several samples that fit poorly may have such a comb at any
     exposure. Starts below ``least`` are left out.
     """
     cells = False
-    histogram, heights, used = histogram_of(pixel, 0), scratch.small[HEIGHTS], 0
+    histogram, heights = histogram_of(pixel, 0), scratch.small[px.HEIGHTS]
     no_starts(heights)
     n = pixel.facts.shape[0]
-    a = best[n + STEP]
+    a = best[n + px.STEP]
     for j in range(n):
-        if not (pixel.facts[j, VARIANCE] < _SPARSE * a * a or (n > 1 and poor)):
-            return used
+        if not (pixel.facts[j, px.VARIANCE] < _SPARSE * a * a or (n > 1 and poor)):
+            return
     if n == 1 and _holds_one(histogram, best):
-        return used
+        return
     for multiple in (1.3, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0):
         if n == 1 and multiple * a < histogram.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
-            used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
+            _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
         elif n > 1:
-            used += _keep_rescaled(pixel, evaluate, cells, best, multiple, scratch)
-    for i in range(N_KEPT):
+            _keep_rescaled(pixel, evaluate, cells, best, multiple, scratch)
+    for i in range(px.N_KEPT):
         if heights[i] < least:
             heights[i] = -math.inf
-    return used
 
 
 @kernel(borrows=True)
@@ -443,19 +412,19 @@ def fill_theta(pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, 
     for j in range(n_samples):
         facts = pixel.facts[j]
         exposure = 0.0
-        if facts[DARK] == 0.0:
-            exposure = max((facts[CENTRE] + facts[MEAN] - bias) / a, _SMALLEST_EXPOSURE)
+        if facts[px.DARK] == 0.0:
+            exposure = max((facts[px.CENTRE] + facts[px.MEAN] - bias) / a, _SMALLEST_EXPOSURE)
         brightest = max(brightest, exposure)
         theta[j] = math.log(max(exposure, 1e-6))
-        weight = facts[N_FRAMES] / (1.0 + exposure)
-        rest += weight * (facts[VARIANCE] - exposure * a * a)
+        weight = facts[px.N_FRAMES] / (1.0 + exposure)
+        rest += weight * (facts[px.VARIANCE] - exposure * a * a)
         n += weight
     if noise2 < 0.0:
         noise2 = max(rest / n, 0.02 * a * a)
-    theta[n_samples + STEP] = a
-    theta[n_samples + BIAS] = bias
-    theta[n_samples + LOG_VARIANCE] = max(math.log(max(noise2, 1e-6)), min_log_variance(a, cells))
-    theta[n_samples + SATELLITE] = 0.0
+    theta[n_samples + px.STEP] = a
+    theta[n_samples + px.BIAS] = bias
+    theta[n_samples + px.LOG_VARIANCE] = max(math.log(max(noise2, 1e-6)), min_log_variance(a, cells))
+    theta[n_samples + px.SATELLITE] = 0.0
     return brightest > _SMALLEST_EXPOSURE
 
 
@@ -469,18 +438,18 @@ def variance_line(pixel: Pixel) -> tuple[float, float, float]:
     weight_sum = x_sum = y_sum = 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        weight = facts[N_FRAMES] / max(facts[VARIANCE] ** 2, 1e-6)
+        weight = facts[px.N_FRAMES] / max(facts[px.VARIANCE] ** 2, 1e-6)
         weight_sum += weight
-        x_sum += weight * (facts[CENTRE] + facts[MEAN])
-        y_sum += weight * facts[VARIANCE]
+        x_sum += weight * (facts[px.CENTRE] + facts[px.MEAN])
+        y_sum += weight * facts[px.VARIANCE]
     x0, y0 = x_sum / weight_sum, y_sum / weight_sum
     xx = xy = 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        weight = facts[N_FRAMES] / max(facts[VARIANCE] ** 2, 1e-6)
-        x = facts[CENTRE] + facts[MEAN] - x0
+        weight = facts[px.N_FRAMES] / max(facts[px.VARIANCE] ** 2, 1e-6)
+        x = facts[px.CENTRE] + facts[px.MEAN] - x0
         xx += weight * x * x
-        xy += weight * x * (facts[VARIANCE] - y0)
+        xy += weight * x * (facts[px.VARIANCE] - y0)
     return (xy / xx if xx > 0.0 else 0.0), x0, y0
 
 
@@ -502,11 +471,11 @@ def _line_start(
     noise2 = (noise * a) ** 2
     bias = x0 - (y0 - noise2) / a
     for j in range(pixel.facts.shape[0]):
-        if pixel.facts[j, DARK] > 0.0:  # it knows bias and read noise by itself
+        if pixel.facts[j, px.DARK] > 0.0:  # it knows bias and read noise by itself
             if not first:
                 return False
-            bias = pixel.facts[j, CENTRE] + pixel.facts[j, MEAN]
-            noise2 = pixel.facts[j, VARIANCE]
+            bias = pixel.facts[j, px.CENTRE] + pixel.facts[j, px.MEAN]
+            noise2 = pixel.facts[j, px.VARIANCE]
     answer: bool = fill_theta(pixel, a, bias, noise2, cells, theta)
     return answer
 
@@ -517,88 +486,90 @@ def _regression_start(
 ) -> tuple[bool, bool]:
     """Fill ``theta`` with the start from the regression of sample j, see `assemble`."""
     facts = pixel.facts
-    if facts[j, DARK] > 0.0 or facts[j, OCCUPIED] < 3:
+    if facts[j, px.DARK] > 0.0 or facts[j, px.OCCUPIED] < 3:
         return False, False
-    own = scratch.small[OTHER]
+    own = scratch.small[px.OTHER]
     found, clear = start_regression(histogram_of(pixel, j), basis, scratch.rows, own)
     if not found:
         return False, False
-    bias = facts[j, CENTRE] + own[2]
+    bias = facts[j, px.CENTRE] + own[2]
     noise2 = math.exp(own[3])
     for i in range(facts.shape[0]):
-        if facts[i, DARK] > 0.0:
-            bias = facts[i, CENTRE] + facts[i, MEAN]
-            noise2 = facts[i, VARIANCE]
+        if facts[i, px.DARK] > 0.0:
+            bias = facts[i, px.CENTRE] + facts[i, px.MEAN]
+            noise2 = facts[i, px.VARIANCE]
     return fill_theta(pixel, own[1], bias, noise2, False, theta), clear
 
 
 @kernel(borrows=True)
-def keep_start(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
-    """Put the start `HERE` among the likeliest, which lie apart; return 1 if it was evaluated."""
-    trial, kept, heights = scratch.small[HERE], scratch.small[KEPT_STARTS:HEIGHTS], scratch.small[HEIGHTS]
+def keep_start(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> None:
+    """Put the start `HERE` among the likeliest, which lie apart."""
+    trial, kept, heights = (
+        scratch.small[px.HERE],
+        scratch.small[px.KEPT_STARTS : px.HEIGHTS],
+        scratch.small[px.HEIGHTS],
+    )
     if not sensible(trial, pixel.longest_step, cells):
-        return 0
-    loglik: float = evaluate(pixel, trial, LOGLIK_ALONE, scratch, scratch.evaluations[AT])
-    place, few = -1, np.bool_(cells and trial[pixel.facts.shape[0] + STEP] < FEW_STEP)
-    for i in range(N_KEPT):
+        return
+    scratch.used[0] += 1
+    loglik: float = evaluate(pixel, trial, px.LOGLIK_ALONE, scratch, scratch.evaluations[px.AT])
+    place, few = -1, np.bool_(cells and trial[pixel.facts.shape[0] + px.STEP] < FEW_STEP)
+    for i in range(px.N_KEPT):
         if heights[i] > -math.inf and same_place(kept[i], trial, few):
             if loglik <= heights[i]:
-                return 1
+                return
             place = i
             break
     if place < 0:
         place = 0
-        for i in range(1, N_KEPT):
+        for i in range(1, px.N_KEPT):
             if heights[i] < heights[place]:
                 place = i
         if loglik <= heights[place]:
-            return 1
+            return
     heights[place] = loglik
     copy(trial, kept[place])
-    return 1
 
 
 @kernel(borrows=True)
 def fill_starts(
     attempt: int, quick: bool, pixel: Pixel, basis: FloatArray, evaluate: Any, scratch: Scratch
-) -> tuple[bool, int]:
+) -> bool:
     """Fill the starts of an attempt from `KEPT_STARTS` on, and their `HEIGHTS`: -inf where there are fewer.
 
-    ``quick``: the first start of a single sample is taken although its side lobe is in the noise.
-
-    Returns:
-        Whether a side lobe of one of several samples stands clear of the noise; evaluations.
+    ``quick``: the first start of a single sample is taken although its side lobe is in the noise. Return
+    whether a side lobe of one of several samples stands clear of it.
     """
-    n_samples, any_clear, used = pixel.facts.shape[0], False, 0
-    trial, heights = scratch.small[HERE], scratch.small[HEIGHTS]
+    n_samples, any_clear = pixel.facts.shape[0], False
+    trial, heights = scratch.small[px.HERE], scratch.small[px.HEIGHTS]
     no_starts(heights)
     if n_samples == 1:
         if attempt > 0:
-            return False, scan_steps(pixel, evaluate, False, scratch)
-        start = scratch.small[KEPT_STARTS]
-        start[1 + SATELLITE] = trial[1 + SATELLITE] = 0.0
+            scan_steps(pixel, evaluate, False, scratch)
+            return False
+        start = scratch.small[px.KEPT_STARTS]
+        start[1 + px.SATELLITE] = trial[1 + px.SATELLITE] = 0.0
         found, clear = start_regression(histogram_of(pixel, 0), basis, scratch.rows, start)
         if clear or (quick and found):
             heights[0] = 0.0
-        return False, 0
+        return False
     for j in range(n_samples):
         found, clear = _regression_start(j, pixel, basis, scratch, trial)
         any_clear = any_clear or (found and clear)
         if found:
-            used += keep_start(pixel, evaluate, False, scratch)
+            keep_start(pixel, evaluate, False, scratch)
     if attempt > 0 or not any_clear:
-        used += add_line_starts(pixel, evaluate, False, attempt > 0, scratch)
-    return any_clear, used
+        add_line_starts(pixel, evaluate, False, attempt > 0, scratch)
+    return any_clear
 
 
 @kernel(borrows=True)
-def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, scratch: Scratch) -> int:
-    """Put starts on the line of variance against mean among the likeliest; return the evaluations."""
-    line, used, trial = variance_line(pixel), 0, scratch.small[HERE]
+def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, scratch: Scratch) -> None:
+    """Put starts on the line of variance against mean among the likeliest."""
+    line, trial = variance_line(pixel), scratch.small[px.HERE]
     for scale in _LINE_SCALES:
         if scale != 1.0 and not thorough:
             break
         for place in range(len(_LINE_NOISES)):
             if _line_start(scale, _LINE_NOISES[place], place == 0, pixel, line, cells, trial):
-                used += keep_start(pixel, evaluate, cells, scratch)
-    return used
+                keep_start(pixel, evaluate, cells, scratch)

@@ -28,31 +28,9 @@ from pchem_pipeline.model.fit.search_numba import (
     ripple_by_chance,
 )
 from pchem_pipeline.model.fit.starts_numba import start_regression
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law, resolve
 from pchem_pipeline.model.law.pixel_numba import (
-    AT_BEST,
-    BIAS,
-    CENTRE,
-    DAMPING,
-    DARK,
-    DERIVATIVES,
-    EXPECTED,
-    FIRST,
-    FIXED,
-    HERE,
-    INFORMATION,
-    LOG_VARIANCE,
-    MEAN,
-    N_BINS,
-    N_BLOCK,
-    N_FRAMES,
-    N_SHARED,
-    OCCUPIED,
-    SATELLITE,
-    SCORE,
-    STEP,
-    VARIANCE,
-    WEIGHT,
     Pixel,
     Scratch,
     copy,
@@ -114,8 +92,8 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
         own += given.origin[index, j]
         if j == 0:
             centre = own
-        room.facts[j, CENTRE] = float(own - centre)
-        widest = max(widest, room.facts[j, N_BINS])
+        room.facts[j, px.CENTRE] = float(own - centre)
+        widest = max(widest, room.facts[j, px.N_BINS])
     return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
 
 
@@ -125,15 +103,15 @@ def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float,
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        n += facts[N_FRAMES]
-        least = min(least, facts[N_FRAMES])
-        if facts[DARK] == 0.0:
-            occupied = max(occupied, facts[OCCUPIED])
-        if facts[N_FRAMES] > 0.0:
-            moments[j, 0] = pixel.centre + facts[CENTRE] + facts[MEAN]
-            moments[j, 1] = facts[VARIANCE]
-            first = pixel.centre + int(facts[CENTRE] + facts[FIRST])
-            lowest, highest = min(lowest, first), max(highest, first + int(facts[N_BINS]) - 1)
+        n += facts[px.N_FRAMES]
+        least = min(least, facts[px.N_FRAMES])
+        if facts[px.DARK] == 0.0:
+            occupied = max(occupied, facts[px.OCCUPIED])
+        if facts[px.N_FRAMES] > 0.0:
+            moments[j, 0] = pixel.centre + facts[px.CENTRE] + facts[px.MEAN]
+            moments[j, 1] = facts[px.VARIANCE]
+            first = pixel.centre + int(facts[px.CENTRE] + facts[px.FIRST])
+            lowest, highest = min(lowest, first), max(highest, first + int(facts[px.N_BINS]) - 1)
     words[LOWEST_DN], words[HIGHEST_DN], words[FRAMES] = lowest, highest, int(n)
     return least, occupied
 
@@ -142,19 +120,19 @@ def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float,
 def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatArray) -> bool:
     """Fill theta, v with the rounding, from (H_1 ... H_J, g, mu, sigma); False unless they are known."""
     n = pixel.facts.shape[0]
-    theta[n + STEP] = 0.0
+    theta[n + px.STEP] = 0.0
     known = 0.0
     for i in range(n + 3):
         known += parameters[i]
     if not math.isfinite(known):
         return False
     for j in range(n):
-        dark = pixel.facts[j, DARK] > 0.0 or not parameters[j] > 0.0
+        dark = pixel.facts[j, px.DARK] > 0.0 or not parameters[j] > 0.0
         theta[j] = limits.bound if dark else math.log(parameters[j])
-    theta[n + STEP] = 1.0 / parameters[n]
-    theta[n + BIAS] = parameters[n + 1] - pixel.centre
-    theta[n + LOG_VARIANCE] = 2.0 * math.log(parameters[n + 2])
-    theta[n + SATELLITE] = 0.0
+    theta[n + px.STEP] = 1.0 / parameters[n]
+    theta[n + px.BIAS] = parameters[n + 1] - pixel.centre
+    theta[n + px.LOG_VARIANCE] = 2.0 * math.log(parameters[n + 2])
+    theta[n + px.SATELLITE] = 0.0
     return True
 
 
@@ -166,17 +144,17 @@ def _expect_information(
 
     The observed one is several times larger where peaks are not resolved, by what looks like peaks by chance.
     """
-    at = scratch.evaluations[AT_BEST]
+    at = scratch.evaluations[px.AT_BEST]
     for j in range(pixel.facts.shape[0]):
-        copy(pixel.bins[j, EXPECTED], pixel.bins[j, WEIGHT])
+        copy(pixel.bins[j, px.EXPECTED], pixel.bins[j, px.WEIGHT])
     if limits.cells:
-        evaluate(pixel, theta, DERIVATIVES, scratch, at)
+        evaluate(pixel, theta, px.DERIVATIVES, scratch, at)
     else:
         fill_squared_scores(pixel, theta, at)
     for j in range(pixel.facts.shape[0]):
-        copy(at[j, SCORE] * 0.0, at[j, SCORE])
-        for row in range(N_BLOCK):
-            copy(at[j, DAMPING + row], at[j, INFORMATION + row])
+        copy(at[j, px.SCORE] * 0.0, at[j, px.SCORE])
+        for row in range(px.N_BLOCK):
+            copy(at[j, px.DAMPING + row], at[j, px.INFORMATION + row])
 
 
 @kernel
@@ -196,16 +174,16 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
     """Fill (H, g, mu, sigma) of single samples from the regression, shape (n, 4); they come as NaN."""
     room = make_room(given, law)
     scratch = make_scratch(1, room.bins.shape[2] - 1, False)
-    theta = scratch.small[HERE]
+    theta = scratch.small[px.HERE]
     for index in range(given.counts.shape[0]):
         pixel = load_pixel(given, index, room)
-        if pixel.facts[0, OCCUPIED] < 3:
+        if pixel.facts[0, px.OCCUPIED] < 3:
             continue
         if start_regression(histogram_of(pixel, 0), basis, scratch.rows, theta)[0]:
             parameters[index, 0] = math.exp(theta[0])
-            parameters[index, 1] = 1.0 / theta[1 + STEP]
-            parameters[index, 2] = theta[1 + BIAS] + pixel.centre
-            parameters[index, 3] = math.exp(0.5 * theta[1 + LOG_VARIANCE])
+            parameters[index, 1] = 1.0 / theta[1 + px.STEP]
+            parameters[index, 2] = theta[1 + px.BIAS] + pixel.centre
+            parameters[index, 3] = math.exp(0.5 * theta[1 + px.LOG_VARIANCE])
 
 
 def _tile_kernel(plain: bool) -> Callable[..., None]:
@@ -221,18 +199,18 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
         covariance: FloatArray,
     ) -> bool:
         """Fill parameters and covariance at a maximum; False unless the information is positive definite."""
-        n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
+        n, at, fixed = pixel.facts.shape[0], scratch.evaluations[px.AT_BEST], scratch.flags[px.FIXED]
         held = fixed.copy()
-        floor = min_log_variance(theta[n + STEP], limits.cells)
-        held[n + LOG_VARIANCE] = theta[n + LOG_VARIANCE] <= floor + 1e-9
-        full = np.empty((n + N_SHARED, n + N_SHARED))
+        floor = min_log_variance(theta[n + px.STEP], limits.cells)
+        held[n + px.LOG_VARIANCE] = theta[n + px.LOG_VARIANCE] <= floor + 1e-9
+        full = np.empty((n + px.N_SHARED, n + px.N_SHARED))
         regular: bool = invert_arrow(at, theta, held, full)
         if not plain and limits.sandwich and regular:
             if not limits.cells:
                 fill_squared_scores(pixel, theta, at)
             enclose(at, theta, full)
         absolute = theta.copy()
-        absolute[n + BIAS] += pixel.centre
+        absolute[n + px.BIAS] += pixel.centre
         rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
         to_natural(absolute, fixed[:n], held, rounding, full, parameters, covariance)
         if not regular:
@@ -259,9 +237,9 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
         room = make_room(given, law)
         scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
         tools = Tools(limits, evaluate, climb, basis, scratch)
-        near, best = np.zeros(n + N_SHARED), np.zeros(n + N_SHARED)
-        fixed = scratch.flags[FIXED]
-        fixed[n + SATELLITE] = True
+        near, best = np.zeros(n + px.N_SHARED), np.zeros(n + px.N_SHARED)
+        fixed = scratch.flags[px.FIXED]
+        fixed[n + px.SATELLITE] = True
         for j in range(n):
             fixed[j] = given.dark[j]
         for index in chosen:
@@ -275,7 +253,7 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
                 continue
             if limits.cells:
                 resolve(law, index, 0.0, pixel)
-            near[n + STEP], gap = 0.0, math.inf
+            near[n + px.STEP], gap, scratch.used[0] = 0.0, math.inf, 0
             if starts.parameters.shape[0] > 0:
                 theta_of(starts.parameters[index], pixel, limits, near)
                 gap = starts.gaps[index]
@@ -284,7 +262,7 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
             task = Task(law, index, amplitudes, near, gap)
             status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
             words[EVALUATIONS] += used
-            if best[n + STEP] > 0.0:
+            if best[n + px.STEP] > 0.0:
                 parameters, covariance = answers.parameters[index], answers.covariance[index]
                 if not plain and n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
                     if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):

@@ -30,72 +30,12 @@ from pchem_pipeline.model.arithmetic.simd_numba import (
     simd_store,
     simd_sum,
 )
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.pixel_numba import (
-    ADDED_EXPOSURE,
-    ADDED_WEIGHT,
-    BIAS,
-    BOTTOM,
-    CENTRE,
-    CLIP_HIGH,
-    CLIP_LOW,
-    CONDITIONAL,
-    COUNT_LAW,
-    CURVATURE,
-    DAMPING,
-    DARK,
-    DENSITY,
-    DISPERSION,
-    EDGE,
-    EDGE_FIRST,
-    EDGES_KEPT,
-    EXPECTATIONS,
-    EXPECTED,
-    EXPOSURE_FACTOR,
-    EXPOSURE_WEIGHT,
-    EXTRA_DN2,
-    EXTRA_E2,
-    FIRST,
-    INFORMATION,
-    KEPT,
-    LEVEL_SCALE,
-    LEVEL_SHIFT,
-    LOG_VARIANCE,
-    LOGLIK_ALONE,
-    MARGIN,
-    MASS,
-    N_BINS,
-    N_BLOCK,
-    N_FRAMES,
-    N_PEAKS,
-    OUTLIER_MASS,
-    OUTLIER_SHARE,
-    OWN,
-    PER_ELECTRON,
-    PER_ELECTRON2,
-    PER_MASS,
-    RATIO,
-    RIGHT,
-    SATELLITE,
-    SCORE,
-    SHARE,
-    SHARE_SLOPE,
-    SHIFT_DN,
-    SHIFT_E,
-    SHIFT_SIGMA,
-    SLOPES,
-    STEP,
-    TAIL,
-    TOP,
-    WEIGHT,
-    WIDTH,
-    Z_DENSITY,
-    Pixel,
-    Scratch,
-)
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
 
 # places in a sample's own parameters
-_EXPOSURE, _STEP, _BIAS, _VARIANCE, _SATELLITE = range(N_BLOCK)
+_EXPOSURE, _STEP, _BIAS, _VARIANCE, _SATELLITE = range(px.N_BLOCK)
 # how far out components are added, in three stages: standard deviations, probability below which an electron
 # number is left out, and the mass of an occupied cell below which the next stage is called for
 _REACH = (8.5, 15.0, FARTHEST)
@@ -216,17 +156,17 @@ def set_peaks(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
             weight = law.peaks[j, row, 0, level]
             for side in range(-1, n_sides):
                 for i in range(3):
-                    peaks[SHIFT_E + i, count] = law.peaks[j, row, 1 + i, level]
-                peaks[WIDTH, count] = law.peaks[j, row, 4, level]
+                    peaks[px.SHIFT_E + i, count] = law.peaks[j, row, 1 + i, level]
+                peaks[px.WIDTH, count] = law.peaks[j, row, 4, level]
                 if side < 0:
-                    peaks[SHARE, count] = weight
-                    peaks[SHARE_SLOPE, count] = -weight if n_sides else 0.0
+                    peaks[px.SHARE, count] = weight
+                    peaks[px.SHARE_SLOPE, count] = -weight if n_sides else 0.0
                 else:
-                    peaks[SHIFT_E, count] += amplitude * law.pattern[side, 0]
-                    peaks[SHARE, count] = 0.0
-                    peaks[SHARE_SLOPE, count] = weight * law.pattern[side, 1]
+                    peaks[px.SHIFT_E, count] += amplitude * law.pattern[side, 0]
+                    peaks[px.SHARE, count] = 0.0
+                    peaks[px.SHARE_SLOPE, count] = weight * law.pattern[side, 1]
                 count += 1
-        pixel.facts[j, N_PEAKS] = float(count)
+        pixel.facts[j, px.N_PEAKS] = float(count)
 
 
 @kernel(borrows=True)
@@ -236,37 +176,37 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     The amplitude is that of free satellites, e-; 0: none.
     """
     for j in range(pixel.facts.shape[0]):
-        facts, edges = pixel.facts[j], pixel.bins[j, EDGE]
+        facts, edges = pixel.facts[j], pixel.bins[j, px.EDGE]
         row = _row(law.numbers, index)
         for i in range(law.numbers.shape[2]):
-            facts[COUNT_LAW + i] = law.numbers[j, row, i]
+            facts[px.COUNT_LAW + i] = law.numbers[j, row, i]
         for i in range(4):
-            facts[LEVEL_SCALE + i] = law.own[j, _row(law.own, index), i]
+            facts[px.LEVEL_SCALE + i] = law.own[j, _row(law.own, index), i]
         row = _row(law.exposures, index)
         for i in range(law.exposures.shape[3]):
-            pixel.mixtures[j, EXPOSURE_WEIGHT, i] = law.exposures[j, row, 0, i]
-            pixel.mixtures[j, EXPOSURE_FACTOR, i] = law.exposures[j, row, 1, i]
+            pixel.mixtures[j, px.EXPOSURE_WEIGHT, i] = law.exposures[j, row, 0, i]
+            pixel.mixtures[j, px.EXPOSURE_FACTOR, i] = law.exposures[j, row, 1, i]
         for i in range(law.added.shape[3]):
-            pixel.mixtures[j, ADDED_WEIGHT, i] = law.added[j, _row(law.added, index), 0, i]
-            pixel.mixtures[j, ADDED_EXPOSURE, i] = law.added[j, _row(law.added, index), 1, i]
-        n_bins, first = int(facts[N_BINS]), facts[FIRST]
-        code = pixel.centre + int(facts[CENTRE] + first)
+            pixel.mixtures[j, px.ADDED_WEIGHT, i] = law.added[j, _row(law.added, index), 0, i]
+            pixel.mixtures[j, px.ADDED_EXPOSURE, i] = law.added[j, _row(law.added, index), 1, i]
+        n_bins, first = int(facts[px.N_BINS]), facts[px.FIRST]
+        code = pixel.centre + int(facts[px.CENTRE] + first)
         margin = 0.0
         bottom, top = -1, n_bins + 1
-        n_shifts, edge_first = law.edge_shift.shape[2], int(facts[EDGE_FIRST])
+        n_shifts, edge_first = law.edge_shift.shape[2], int(facts[px.EDGE_FIRST])
         row = _row(law.edge_shift, index)
         for i in range(n_bins + 1):
             place = code + i - edge_first
             shift = law.edge_shift[j, row, place] if 0 <= place < n_shifts else 0.0
             margin = max(margin, abs(shift))
             edges[i] = first + i - 0.5 + shift
-            if code + i <= facts[CLIP_LOW]:
+            if code + i <= facts[px.CLIP_LOW]:
                 edges[i], bottom = -math.inf, i
-            elif code + i > facts[CLIP_HIGH]:
+            elif code + i > facts[px.CLIP_HIGH]:
                 edges[i], top = math.inf, min(top, i)
         for i in range(n_bins + 1, n_bins + 1 + SIMD_WIDTH):
             edges[i] = math.inf
-        facts[BOTTOM], facts[TOP], facts[MARGIN] = float(bottom), float(top), margin
+        facts[px.BOTTOM], facts[px.TOP], facts[px.MARGIN] = float(bottom), float(top), margin
     set_peaks(law, index, amplitude, pixel)
 
 
@@ -276,27 +216,27 @@ def cells_of(pixel: Pixel, j: int) -> Cells:
     bins, facts = pixel.bins[j], pixel.facts[j]
     return Cells(
         bins,
-        int(facts[N_BINS]),
-        int(facts[BOTTOM]),
-        int(facts[TOP]),
-        facts[MARGIN],
-        facts[FIRST] - 0.5,
-        facts[N_FRAMES],
-        facts[CONDITIONAL] > 0.0,
+        int(facts[px.N_BINS]),
+        int(facts[px.BOTTOM]),
+        int(facts[px.TOP]),
+        facts[px.MARGIN],
+        facts[px.FIRST] - 0.5,
+        facts[px.N_FRAMES],
+        facts[px.CONDITIONAL] > 0.0,
         pixel.peaks[j],
-        int(facts[N_PEAKS]),
+        int(facts[px.N_PEAKS]),
         pixel.mixtures[j],
-        int(facts[COUNT_LAW]),
-        facts[DISPERSION],
-        facts[LEVEL_SCALE],
-        facts[LEVEL_SHIFT],
-        facts[CURVATURE],
-        facts[EXTRA_E2],
-        facts[EXTRA_DN2],
-        facts[PER_ELECTRON],
-        facts[PER_ELECTRON2],
-        facts[OUTLIER_SHARE],
-        facts[OUTLIER_MASS],
+        int(facts[px.COUNT_LAW]),
+        facts[px.DISPERSION],
+        facts[px.LEVEL_SCALE],
+        facts[px.LEVEL_SHIFT],
+        facts[px.CURVATURE],
+        facts[px.EXTRA_E2],
+        facts[px.EXTRA_DN2],
+        facts[px.PER_ELECTRON],
+        facts[px.PER_ELECTRON2],
+        facts[px.OUTLIER_SHARE],
+        facts[px.OUTLIER_MASS],
     )
 
 
@@ -311,10 +251,10 @@ def component(k: float, peak: int, theta: FloatArray, cells: Cells, reach: float
     """Return one electron number at one level; ``low >= high`` where it gives nothing to the cells."""
     a, analog2 = theta[_STEP], math.exp(theta[_VARIANCE])
     peaks = cells.peaks
-    charge = _level(k, cells) + peaks[SHIFT_E, peak]
-    by_sigma = peaks[SHIFT_SIGMA, peak] * math.sqrt(analog2)
-    mean = theta[_BIAS] + a * charge + peaks[SHIFT_DN, peak] + by_sigma
-    own = peaks[WIDTH, peak] * peaks[WIDTH, peak] * analog2
+    charge = _level(k, cells) + peaks[px.SHIFT_E, peak]
+    by_sigma = peaks[px.SHIFT_SIGMA, peak] * math.sqrt(analog2)
+    mean = theta[_BIAS] + a * charge + peaks[px.SHIFT_DN, peak] + by_sigma
+    own = peaks[px.WIDTH, peak] * peaks[px.WIDTH, peak] * analog2
     spread = cells.extra_e2 + k * (cells.per_electron + k * cells.per_electron2)
     variance = max(own + a * a * spread + cells.extra_dn2, LEAST_VARIANCE)
     sd = math.sqrt(variance)
@@ -325,7 +265,11 @@ def component(k: float, peak: int, theta: FloatArray, cells: Cells, reach: float
     # what lies beyond the limits belongs to the first or last code that comes out
     high = min(max(high, cells.bottom + 1), cells.n_bins)
     low = max(min(low, cells.top - 1), 0)
-    if peaks[SHARE, peak] + theta[_SATELLITE] * peaks[SHARE_SLOPE, peak] == peaks[SHARE_SLOPE, peak] == 0.0:
+    if (
+        peaks[px.SHARE, peak] + theta[_SATELLITE] * peaks[px.SHARE_SLOPE, peak]
+        == peaks[px.SHARE_SLOPE, peak]
+        == 0.0
+    ):
         high = low
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
@@ -336,15 +280,15 @@ def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, num
     a, analog2, exposure = theta[_STEP], math.exp(theta[_VARIANCE]), math.exp(theta[_EXPOSURE])
     widest = farthest = 0.0
     for peak in range(cells.n_peaks):
-        widest = max(widest, cells.peaks[WIDTH, peak])
-        shift = a * abs(cells.peaks[SHIFT_E, peak]) + abs(cells.peaks[SHIFT_DN, peak])
-        farthest = max(farthest, shift + abs(cells.peaks[SHIFT_SIGMA, peak]) * math.sqrt(analog2))
+        widest = max(widest, cells.peaks[px.WIDTH, peak])
+        shift = a * abs(cells.peaks[px.SHIFT_E, peak]) + abs(cells.peaks[px.SHIFT_DN, peak])
+        farthest = max(farthest, shift + abs(cells.peaks[px.SHIFT_SIGMA, peak]) * math.sqrt(analog2))
     from_below, to_above = cells.bottom >= 0, cells.top <= cells.n_bins
     last = cells.first + cells.n_bins + cells.margin
     factor = added = 0.0
     for i in range(cells.mixtures.shape[1]):
-        factor = max(factor, cells.mixtures[EXPOSURE_FACTOR, i])
-        added = max(added, cells.mixtures[ADDED_EXPOSURE, i])
+        factor = max(factor, cells.mixtures[px.EXPOSURE_FACTOR, i])
+        added = max(added, cells.mixtures[px.ADDED_EXPOSURE, i])
     most = exposure * factor + added
     count, previous = 0, -math.inf
     k = 0.0
@@ -374,9 +318,9 @@ def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, num
 def _place_for(part: Component, place: int) -> tuple[int, int]:
     """Return where the edges of a component are kept, and where those of the next one; where only for now."""
     width = part.high - part.low + 1 + SIMD_WIDTH
-    if place + width <= EDGES_KEPT:
+    if place + width <= px.EDGES_KEPT:
         return place, place + width
-    return EDGES_KEPT, EDGES_KEPT
+    return px.EDGES_KEPT, px.EDGES_KEPT
 
 
 @kernel(borrows=True)
@@ -385,10 +329,10 @@ def _fill_edges(bins: FloatArray, part: Component, edges: FloatArray, place: int
     mean, inverse = part.mean, 1.0 / part.sd
     behind = place
     for i in range(part.low, part.high + 1, SIMD_WIDTH):
-        tail, density, by_z = simd_tail((simd_load(bins, EDGE, i) - mean) * inverse)
-        simd_store(edges, TAIL, behind, tail)
-        simd_store(edges, DENSITY, behind, density)
-        simd_store(edges, Z_DENSITY, behind, by_z)
+        tail, density, by_z = simd_tail((simd_load(bins, px.EDGE, i) - mean) * inverse)
+        simd_store(edges, px.TAIL, behind, tail)
+        simd_store(edges, px.DENSITY, behind, density)
+        simd_store(edges, px.Z_DENSITY, behind, by_z)
         behind += SIMD_WIDTH
     for row in range(3):  # the last cell of the last lanes has no other edge
         edges[row, behind] = edges[row, behind - 1]
@@ -398,9 +342,9 @@ def _fill_edges(bins: FloatArray, part: Component, edges: FloatArray, place: int
 def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
     """Return the cell that holds a mean, if it is one of these, the end excluded, or one outside."""
     middle = int(min(max(mean - cells.first, low - 1.0), float(high)))
-    while middle < high and cells.bins[EDGE, middle + 1] <= mean:
+    while middle < high and cells.bins[px.EDGE, middle + 1] <= mean:
         middle += 1
-    while middle >= low and cells.bins[EDGE, middle] > mean:
+    while middle >= low and cells.bins[px.EDGE, middle] > mean:
         middle -= 1
     return middle
 
@@ -418,36 +362,36 @@ def _add_component(
     room: FloatArray,
 ) -> None:
     """Add what an electron number gives at one level to mass and slopes of the cells within reach."""
-    share_slope = cells.peaks[SHARE_SLOPE, peak]
-    share = cells.peaks[SHARE, peak] + satellite * share_slope
+    share_slope = cells.peaks[px.SHARE_SLOPE, peak]
+    share = cells.peaks[px.SHARE, peak] + satellite * share_slope
     w, w_exposure, w_satellite = row[1] * share, row[2] * share, row[1] * share_slope
     by_mean, by_variance = -w / part.sd, -0.5 * w / part.variance
     step1, step2 = by_mean * part.mean_step, by_variance * part.variance_step
     log1, log2 = by_mean * part.mean_log, by_variance * part.variance_log
     for i in range(part.low, part.high, SIMD_WIDTH):
         c = place + i - part.low
-        d0 = simd_load(edges, TAIL, c + 1) - simd_load(edges, TAIL, c)
-        simd_store(room, MASS, i, fused(d0, w, simd_load(room, MASS, i)))
-        if what == LOGLIK_ALONE:
+        d0 = simd_load(edges, px.TAIL, c + 1) - simd_load(edges, px.TAIL, c)
+        simd_store(room, px.MASS, i, fused(d0, w, simd_load(room, px.MASS, i)))
+        if what == px.LOGLIK_ALONE:
             continue
-        d1 = simd_load(edges, DENSITY, c + 1) - simd_load(edges, DENSITY, c)
-        d2 = simd_load(edges, Z_DENSITY, c + 1) - simd_load(edges, Z_DENSITY, c)
-        slope = fused(d0, w_exposure, simd_load(room, SLOPES + _EXPOSURE, i))
-        simd_store(room, SLOPES + _EXPOSURE, i, slope)
-        slope = fused(d1, step1, fused(d2, step2, simd_load(room, SLOPES + _STEP, i)))
-        simd_store(room, SLOPES + _STEP, i, slope)
-        slope = fused(d1, by_mean, simd_load(room, SLOPES + _BIAS, i))
-        simd_store(room, SLOPES + _BIAS, i, slope)
-        slope = fused(d1, log1, fused(d2, log2, simd_load(room, SLOPES + _VARIANCE, i)))
-        simd_store(room, SLOPES + _VARIANCE, i, slope)
+        d1 = simd_load(edges, px.DENSITY, c + 1) - simd_load(edges, px.DENSITY, c)
+        d2 = simd_load(edges, px.Z_DENSITY, c + 1) - simd_load(edges, px.Z_DENSITY, c)
+        slope = fused(d0, w_exposure, simd_load(room, px.SLOPES + _EXPOSURE, i))
+        simd_store(room, px.SLOPES + _EXPOSURE, i, slope)
+        slope = fused(d1, step1, fused(d2, step2, simd_load(room, px.SLOPES + _STEP, i)))
+        simd_store(room, px.SLOPES + _STEP, i, slope)
+        slope = fused(d1, by_mean, simd_load(room, px.SLOPES + _BIAS, i))
+        simd_store(room, px.SLOPES + _BIAS, i, slope)
+        slope = fused(d1, log1, fused(d2, log2, simd_load(room, px.SLOPES + _VARIANCE, i)))
+        simd_store(room, px.SLOPES + _VARIANCE, i, slope)
         if w_satellite != 0.0:
-            slope = fused(d0, w_satellite, simd_load(room, SLOPES + _SATELLITE, i))
-            simd_store(room, SLOPES + _SATELLITE, i, slope)
+            slope = fused(d0, w_satellite, simd_load(room, px.SLOPES + _SATELLITE, i))
+            simd_store(room, px.SLOPES + _SATELLITE, i, slope)
     middle = cell_of(part.mean, cells, part.low, part.high)
     if part.low <= middle < part.high:  # both tails are those beyond its edges
-        room[MASS, middle] += w
-        room[SLOPES + _EXPOSURE, middle] += w_exposure
-        room[SLOPES + _SATELLITE, middle] += w_satellite
+        room[px.MASS, middle] += w
+        room[px.SLOPES + _EXPOSURE, middle] += w_exposure
+        room[px.SLOPES + _SATELLITE, middle] += w_satellite
 
 
 @kernel(borrows=True)
@@ -466,9 +410,9 @@ def fill_masses(
     the ``room``, rows of a scratch's ``cells``; electron numbers in use and edges are left, too.
     """
     reach, cut = _REACH[stage], _CUT[stage]
-    for row in range(1 if what == LOGLIK_ALONE else N_BLOCK + 1):
+    for row in range(1 if what == px.LOGLIK_ALONE else px.N_BLOCK + 1):
         for i in range(0, cells.n_bins, SIMD_WIDTH):
-            simd_store(room, MASS if row == 0 else SLOPES + row - 1, i, 0.0)
+            simd_store(room, px.MASS if row == 0 else px.SLOPES + row - 1, i, 0.0)
     count: int = _list_numbers(theta, cells, reach, cut, numbers)
     following = 0
     for row in range(count):
@@ -482,9 +426,9 @@ def fill_masses(
     if cells.outlier_share > 0.0:
         rest = 1.0 - cells.outlier_share
         for i in range(cells.n_bins):
-            room[MASS, i] = rest * room[MASS, i] + cells.outlier_mass
-            for j in range(N_BLOCK):
-                room[SLOPES + j, i] *= rest
+            room[px.MASS, i] = rest * room[px.MASS, i] + cells.outlier_mass
+            for j in range(px.N_BLOCK):
+                room[px.SLOPES + j, i] *= rest
     return count
 
 
@@ -501,8 +445,8 @@ def fill_far_enough(
         count = fill_masses(theta, cells, stage, what, numbers, edges, room)
         lowest = 1.0
         for i in range(cells.n_bins):
-            if cells.bins[WEIGHT, i] > 0.0:
-                lowest = min(lowest, room[MASS, i])
+            if cells.bins[px.WEIGHT, i] > 0.0:
+                lowest = min(lowest, room[px.MASS, i])
         if lowest >= _OUTLIER[stage]:
             break
     return count, _REACH[stage]
@@ -513,12 +457,12 @@ def _log_mass(cells: Cells, room: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
-        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), SMALLEST_MASS)
+        weight, own = simd_load(cells.bins, px.WEIGHT, i), most(simd_load(room, px.MASS, i), SMALLEST_MASS)
         total = fused(weight, simd_log(own), total)
     if cells.conditional:
         inside = 0.0
         for i in range(cells.n_bins):
-            inside += cells.bins[KEPT, i] * room[MASS, i]
+            inside += cells.bins[px.KEPT, i] * room[px.MASS, i]
     return float(simd_sum(total)) - cells.frames * math.log(max(inside, SMALLEST_MASS))
 
 
@@ -527,31 +471,31 @@ def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray)
     """Return the log-likelihood of the masses in the room; add score and squared scores, fill ratios."""
     total = counting() * 0.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
-        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), SMALLEST_MASS)
+        weight, own = simd_load(cells.bins, px.WEIGHT, i), most(simd_load(room, px.MASS, i), SMALLEST_MASS)
         total = fused(weight, simd_log(own), total)
         # a mass that is hardly one has no slope
         per_mass = least((own - SMALLEST_MASS) * _TO_ONE, 1.0) / own
-        simd_store(room, PER_MASS, i, per_mass)
-        simd_store(room, RATIO, i, weight * per_mass)
-    simd_store(room, RATIO, cells.n_bins, 0.0)
+        simd_store(room, px.PER_MASS, i, per_mass)
+        simd_store(room, px.RATIO, i, weight * per_mass)
+    simd_store(room, px.RATIO, cells.n_bins, 0.0)
     loglik = float(simd_sum(total))
-    for row in range(N_BLOCK):
+    for row in range(px.N_BLOCK):
         score = counting() * 0.0
         for i in range(0, cells.n_bins, SIMD_WIDTH):
-            score = fused(simd_load(room, RATIO, i), simd_load(room, SLOPES + row, i), score)
-        out[SCORE, row] += simd_sum(score)
+            score = fused(simd_load(room, px.RATIO, i), simd_load(room, px.SLOPES + row, i), score)
+        out[px.SCORE, row] += simd_sum(score)
         for column in range(row + 1):
             square = counting() * 0.0
             for i in range(0, cells.n_bins, SIMD_WIDTH):
-                here = simd_load(room, RATIO, i) * simd_load(room, SLOPES + row, i)
-                other = simd_load(room, PER_MASS, i) * simd_load(room, SLOPES + column, i)
+                here = simd_load(room, px.RATIO, i) * simd_load(room, px.SLOPES + row, i)
+                other = simd_load(room, px.PER_MASS, i) * simd_load(room, px.SLOPES + column, i)
                 square = fused(here, other, square)
             both = simd_sum(square)
-            out[DAMPING + row, column] += both
-            out[INFORMATION + row, column] += both
+            out[px.DAMPING + row, column] += both
+            out[px.INFORMATION + row, column] += both
     if cells.outlier_share > 0.0:
         for i in range(cells.n_bins):
-            room[RATIO, i] *= 1.0 - cells.outlier_share
+            room[px.RATIO, i] *= 1.0 - cells.outlier_share
     if cells.conditional:
         loglik += _condition(cells, room, change, out)
     return loglik
@@ -563,29 +507,29 @@ def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArr
 
     With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean.
     """
-    mass, slopes, ratios = room[MASS], room[SLOPES:], room[RATIO]
+    mass, slopes, ratios = room[px.MASS], room[px.SLOPES :], room[px.RATIO]
     n, rest = cells.frames, 1.0 - cells.outlier_share
     inside = 0.0
-    for i in range(N_BLOCK):
+    for i in range(px.N_BLOCK):
         change[i] = 0.0
     for cell in range(cells.n_bins):
-        inside += cells.bins[KEPT, cell] * mass[cell]
-        for i in range(N_BLOCK):
-            change[i] += cells.bins[KEPT, cell] * slopes[i, cell]
+        inside += cells.bins[px.KEPT, cell] * mass[cell]
+        for i in range(px.N_BLOCK):
+            change[i] += cells.bins[px.KEPT, cell] * slopes[i, cell]
     inside = max(inside, SMALLEST_MASS)
-    for i in range(N_BLOCK):
+    for i in range(px.N_BLOCK):
         change[i] /= inside
-    for i in range(N_BLOCK):
+    for i in range(px.N_BLOCK):
         for j in range(i + 1):
             # the observed information of -n log M is n (d2 M / M - dM dM' / M^2); the first part comes by
             # the ratios
-            out[INFORMATION + i, j] -= n * change[i] * change[j]
-            shared = n * change[i] * change[j] - out[SCORE, i] * change[j] - change[i] * out[SCORE, j]
-            out[DAMPING + i, j] += shared
-    for i in range(N_BLOCK):
-        out[SCORE, i] -= n * change[i]
+            out[px.INFORMATION + i, j] -= n * change[i] * change[j]
+            shared = n * change[i] * change[j] - out[px.SCORE, i] * change[j] - change[i] * out[px.SCORE, j]
+            out[px.DAMPING + i, j] += shared
+    for i in range(px.N_BLOCK):
+        out[px.SCORE, i] -= n * change[i]
     for cell in range(cells.n_bins):
-        ratios[cell] -= cells.bins[KEPT, cell] * n / inside * rest
+        ratios[cell] -= cells.bins[px.KEPT, cell] * n / inside * rest
     return -n * math.log(inside)
 
 
@@ -597,21 +541,21 @@ def _hermite_sums(
     mean, inverse = part.mean, 1.0 / part.sd
     s0 = s1 = s2 = s3 = s4 = counting() * 0.0
     for i in range(part.low, part.high, SIMD_WIDTH):
-        c, ratio = place + i - part.low, simd_load(room, RATIO, i)
-        s0 = fused(ratio, simd_load(edges, TAIL, c + 1) - simd_load(edges, TAIL, c), s0)
-        density0, density1 = simd_load(edges, DENSITY, c), simd_load(edges, DENSITY, c + 1)
-        by_z0, by_z1 = simd_load(edges, Z_DENSITY, c), simd_load(edges, Z_DENSITY, c + 1)
+        c, ratio = place + i - part.low, simd_load(room, px.RATIO, i)
+        s0 = fused(ratio, simd_load(edges, px.TAIL, c + 1) - simd_load(edges, px.TAIL, c), s0)
+        density0, density1 = simd_load(edges, px.DENSITY, c), simd_load(edges, px.DENSITY, c + 1)
+        by_z0, by_z1 = simd_load(edges, px.Z_DENSITY, c), simd_load(edges, px.Z_DENSITY, c + 1)
         s1 = fused(ratio, density1 - density0, s1)
         s2 = fused(ratio, by_z1 - by_z0, s2)
         # where an edge is infinite, both are 0
-        z0 = most(least((simd_load(cells.bins, EDGE, i) - mean) * inverse, FARTHEST), -FARTHEST)
-        z1 = most(least((simd_load(cells.bins, EDGE, i + 1) - mean) * inverse, FARTHEST), -FARTHEST)
+        z0 = most(least((simd_load(cells.bins, px.EDGE, i) - mean) * inverse, FARTHEST), -FARTHEST)
+        z1 = most(least((simd_load(cells.bins, px.EDGE, i + 1) - mean) * inverse, FARTHEST), -FARTHEST)
         s3 = fused(ratio, z1 * by_z1 - density1 - (z0 * by_z0 - density0), s3)
         s4 = fused(ratio, (z1 * z1 - 3.0) * by_z1 - (z0 * z0 - 3.0) * by_z0, s4)
     whole = float(simd_sum(s0))
     middle = cell_of(part.mean, cells, part.low, part.high)
     if part.low <= middle < part.high:
-        whole += room[RATIO, middle]
+        whole += room[px.RATIO, middle]
     return whole, float(simd_sum(s1)), float(simd_sum(s2)), float(simd_sum(s3)), float(simd_sum(s4))
 
 
@@ -626,18 +570,18 @@ def _subtract_curvature(
     out: FloatArray,
 ) -> None:
     """Take the second derivatives of the masses, times counts over mass, off the information."""
-    information = out[INFORMATION:DAMPING]
+    information = out[px.INFORMATION : px.DAMPING]
     following = 0
     for row in range(numbers.shape[0]):
         k, p0, p1, p2 = numbers[row, 0], numbers[row, 1], numbers[row, 2], numbers[row, 3]
         for peak in range(cells.n_peaks):
-            slope = cells.peaks[SHARE_SLOPE, peak]
-            share = cells.peaks[SHARE, peak] + theta[_SATELLITE] * slope
+            slope = cells.peaks[px.SHARE_SLOPE, peak]
+            share = cells.peaks[px.SHARE, peak] + theta[_SATELLITE] * slope
             part = component(k, peak, theta, cells, reach)
             if part.low >= part.high:
                 continue
             place, following = _place_for(part, following)
-            if place == EDGES_KEPT:
+            if place == px.EDGES_KEPT:
                 _fill_edges(cells.bins, part, edges, place)
             s0, s1, s2, s3, s4 = _hermite_sums(cells, part, room, edges, place)
             q, sd = part.variance, part.sd
@@ -672,9 +616,9 @@ def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
     if cells.conditional:
         inside = 0.0
         for i in range(cells.n_bins):
-            inside += cells.bins[KEPT, i] * room[MASS, i]
+            inside += cells.bins[px.KEPT, i] * room[px.MASS, i]
     for i in range(cells.n_bins):
-        pixel.bins[j, EXPECTED, i] = cells.frames * cells.bins[KEPT, i] * room[MASS, i] / inside
+        pixel.bins[j, px.EXPECTED, i] = cells.frames * cells.bins[px.KEPT, i] * room[px.MASS, i] / inside
 
 
 def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
@@ -683,28 +627,28 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
     See :func:`.density_numba.evaluate_density`; of fewer exposures in theta than samples, the last is that of
     all others. The ``cells`` of the scratch keep the masses and their slopes.
     """
-    own, n, loglik = scratch.small[OWN], theta.size - N_BLOCK + 1, 0.0
-    own[_STEP], own[_VARIANCE] = theta[n + STEP], theta[n + LOG_VARIANCE]
-    own[_SATELLITE] = theta[n + SATELLITE]
-    for place in range(n if what != LOGLIK_ALONE else 0):
-        for row in range(DAMPING + N_BLOCK):
-            for column in range(N_BLOCK):
+    own, n, loglik = scratch.small[px.OWN], theta.size - px.N_BLOCK + 1, 0.0
+    own[_STEP], own[_VARIANCE] = theta[n + px.STEP], theta[n + px.LOG_VARIANCE]
+    own[_SATELLITE] = theta[n + px.SATELLITE]
+    for place in range(n if what != px.LOGLIK_ALONE else 0):
+        for row in range(px.DAMPING + px.N_BLOCK):
+            for column in range(px.N_BLOCK):
                 out[place, row, column] = 0.0
     for j in range(pixel.facts.shape[0]):
         place = min(j, n - 1)
-        own[_EXPOSURE] = theta[place] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
-        own[_BIAS] = theta[n + BIAS] - pixel.facts[j, CENTRE]
+        own[_EXPOSURE] = theta[place] if pixel.facts[j, px.DARK] == 0.0 else _NO_ELECTRONS
+        own[_BIAS] = theta[n + px.BIAS] - pixel.facts[j, px.CENTRE]
         cells, room = cells_of(pixel, j), scratch.cells[place]
         count, reach = fill_far_enough(own, cells, what, scratch.numbers, scratch.edges, room)
-        if what == LOGLIK_ALONE:
+        if what == px.LOGLIK_ALONE:
             loglik += _log_mass(cells, room)
             continue
-        loglik += _sum_up(cells, room, scratch.small[RIGHT], out[place])
+        loglik += _sum_up(cells, room, scratch.small[px.RIGHT], out[place])
         _subtract_curvature(own, cells, reach, scratch.numbers[:count], scratch.edges, room, out[place])
-        if what == EXPECTATIONS:
+        if what == px.EXPECTATIONS:
             _expect(pixel, j, cells, room)
-        if pixel.facts[j, DARK] > 0.0:
-            out[place, SCORE, 0] = 0.0
-            for i in range(N_BLOCK):
-                out[place, INFORMATION + i, 0] = out[place, DAMPING + i, 0] = 0.0
+        if pixel.facts[j, px.DARK] > 0.0:
+            out[place, px.SCORE, 0] = 0.0
+            for i in range(px.N_BLOCK):
+                out[place, px.INFORMATION + i, 0] = out[place, px.DAMPING + i, 0] = 0.0
     return loglik

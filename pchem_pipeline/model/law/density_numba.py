@@ -37,38 +37,8 @@ from pchem_pipeline.model.arithmetic.simd_numba import (
     simd_sum,
     spliced,
 )
-from pchem_pipeline.model.law.pixel_numba import (
-    BIAS,
-    CENTRE,
-    CUMULATIVE,
-    DAMPING,
-    DARK,
-    EXPECTATIONS,
-    EXPECTED,
-    FIRST,
-    INFORMATION,
-    LOG_VARIANCE,
-    LOGLIK_ALONE,
-    MAX_COMPONENTS,
-    MEAN,
-    N_BINS,
-    N_BLOCK,
-    N_FRAMES,
-    N_NEGATIVE,
-    N_ROWS,
-    SCORE,
-    STEP,
-    SUM_E,
-    SUM_EE,
-    SUM_K,
-    SUM_KE,
-    SUM_KK,
-    SUMS,
-    VARIANCE,
-    WEIGHT,
-    Pixel,
-    Scratch,
-)
+from pchem_pipeline.model.law import pixel_numba as px
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
 
 # nats below the nearest component at which a component is left out: exp(-22) = 3e-10 moves estimates by some
 # 1e-7 standard errors; and of the log-likelihood alone
@@ -109,7 +79,7 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int, d
         half += variance * max(
             abs(math.log(exposure / (first + 1.0))), abs(math.log(exposure / (last + 1.0)))
         )
-    return min(max(1, math.ceil(half)), (MAX_COMPONENTS - 1) // 2)
+    return min(max(1, math.ceil(half)), (px.MAX_COMPONENTS - 1) // 2)
 
 
 @kernel(inline=True, borrows=True)
@@ -118,11 +88,11 @@ def _fill_levels(
 ) -> None:
     """Fill the logarithms of the weights of components, from ``first - half`` to ``last + half + 1``."""
     lowest, end = comb.first - comb.half, comb.last + comb.half + 2
-    known = end + N_NEGATIVE + SIMD_WIDTH <= log_factorials.shape[1]
+    known = end + px.N_NEGATIVE + SIMD_WIDTH <= log_factorials.shape[1]
     for k in range(lowest, end, SIMD_WIDTH):
         number = counting() + float(k)
         if known:
-            log_factorial = simd_load(log_factorials, 0, k + N_NEGATIVE)
+            log_factorial = simd_load(log_factorials, 0, k + px.N_NEGATIVE)
         else:  # Stirling's series: all of these are large
             per = 1.0 / number
             rest = fused(per, fused(per * per, -1.0 / 360.0, 1.0 / 12.0), 0.5 * LOG_2PI)
@@ -193,7 +163,7 @@ def _weighted_logs(bins: FloatArray, rows: FloatArray, n_bins: int) -> Simd:
     """Sum up counts times the logarithms of `_DENSITY`, in a loop so short that several are under way."""
     total = counting() * 0.0
     for i in range(0, n_bins, SIMD_WIDTH):
-        total = fused(simd_load(bins, WEIGHT, i), simd_log(simd_load(rows, _DENSITY, i)), total)
+        total = fused(simd_load(bins, px.WEIGHT, i), simd_log(simd_load(rows, _DENSITY, i)), total)
     return total
 
 
@@ -245,12 +215,12 @@ def _sums_kernel(width: int) -> Callable[..., Any]:
         for block in range(n_blocks):
             start = block * comb.stride
             stop = min(start + comb.stride, comb.n_bins)
-            if not bins[CUMULATIVE, stop] > bins[CUMULATIVE, start]:
+            if not bins[px.CUMULATIVE, stop] > bins[px.CUMULATIVE, start]:
                 simd_store(rows, _DENSITY, start, zero + 1.0)
                 continue
             cell, own = int(rows[_CELL, block]), int(rows[_OWN, block])
             left, right = coefficients[cell], coefficients[cell + 1]
-            c = spliced(stop - start, simd_load(bins, WEIGHT, start), 0.0)
+            c = spliced(stop - start, simd_load(bins, px.WEIGHT, start), 0.0)
             y = counting() + (start - comb.zero)
             d, r, level = _lanes(block, own, cell, half, rows, ratios, most_ratio)
             # by Horner's rule: the polynomial, and its n-th derivatives over n!
@@ -303,7 +273,7 @@ def _loglik_alone(
     for block in range(n_blocks):
         start = block * comb.stride
         stop = min(start + comb.stride, comb.n_bins)
-        if frames == 0.0 and not bins[CUMULATIVE, stop] > bins[CUMULATIVE, start]:
+        if frames == 0.0 and not bins[px.CUMULATIVE, stop] > bins[px.CUMULATIVE, start]:
             simd_store(rows, _DENSITY, start, counting() * 0.0 + 1.0)
             continue
         cell, own = int(rows[_CELL, block]), int(rows[_OWN, block])
@@ -315,9 +285,9 @@ def _loglik_alone(
         level = fused(d * d, spread, level)
         if frames > 0.0:
             level = simd_exp(most(least(level, -LEAST_EXPONENT), LEAST_EXPONENT))
-            simd_store(bins, EXPECTED, start, density * frames * level)
+            simd_store(bins, px.EXPECTED, start, density * frames * level)
         else:
-            c = spliced(stop - start, simd_load(bins, WEIGHT, start), 0.0)
+            c = spliced(stop - start, simd_load(bins, px.WEIGHT, start), 0.0)
             simd_store(rows, _DENSITY, start, density)
             loglik = fused(c, level, loglik)
     if frames == 0.0:
@@ -339,16 +309,17 @@ def _finish(
 
     The complete-data score is ``(k - H, k e/s2, e/s2, e^2/2 s2 - 1/2)`` with ``k = (y - e)/a``.
     """
-    n = facts[N_FRAMES]
-    score, sums = out[SCORE], out[SUMS]
+    n = facts[px.N_FRAMES]
+    score, sums = out[px.SCORE], out[px.SUMS]
     exposure = math.exp(log_exposure)
     t = a * inverse
-    mean = facts[MEAN] - bias
+    mean = facts[px.MEAN] - bias
     sum_e, sum_ee, sum_ye = totals[_E], totals[_EE] + a * a * totals[_V11], totals[_YE]
     sum_k = (n * mean - sum_e) / a
     sum_ke = (sum_ye - sum_ee) / a
-    sum_kk = (n * (facts[VARIANCE] + mean * mean) - 2.0 * sum_ye + sum_ee) / (a * a)
-    sums[SUM_K], sums[SUM_KK], sums[SUM_KE], sums[SUM_E], sums[SUM_EE] = sum_k, sum_kk, sum_ke, sum_e, sum_ee
+    sum_kk = (n * (facts[px.VARIANCE] + mean * mean) - 2.0 * sum_ye + sum_ee) / (a * a)
+    sums[px.SUM_K], sums[px.SUM_KK], sums[px.SUM_KE] = sum_k, sum_kk, sum_ke
+    sums[px.SUM_E], sums[px.SUM_EE] = sum_e, sum_ee
     v11, v12, v22 = totals[_V11], totals[_V12], totals[_V22]
     cov01 = inverse * (v12 - totals[_V11Y])
     score[0] = sum_k - n * exposure
@@ -356,33 +327,33 @@ def _finish(
     score[2] = sum_e * inverse
     score[3] = 0.5 * (sum_ee * inverse - n)
     _fill_complete(n, n * exposure, inverse, out)
-    out[INFORMATION, 0] = n * exposure - v11
-    out[INFORMATION + 1, 0] = -cov01
-    out[INFORMATION + 2, 0] = t * v11
-    out[INFORMATION + 3, 0] = 0.5 * t * v12
-    out[INFORMATION + 1, 1] = sum_kk * inverse - inverse * inverse * (
+    out[px.INFORMATION, 0] = n * exposure - v11
+    out[px.INFORMATION + 1, 0] = -cov01
+    out[px.INFORMATION + 2, 0] = t * v11
+    out[px.INFORMATION + 3, 0] = 0.5 * t * v12
+    out[px.INFORMATION + 1, 1] = sum_kk * inverse - inverse * inverse * (
         totals[_V11YY] - 2.0 * totals[_V12Y] + v22
     )
-    out[INFORMATION + 2, 1] = sum_k * inverse + t * cov01
-    out[INFORMATION + 3, 1] = sum_ke * inverse - 0.5 * t * inverse * (totals[_V12Y] - v22)
-    out[INFORMATION + 2, 2] = n * inverse - t * t * v11
-    out[INFORMATION + 3, 2] = sum_e * inverse - 0.5 * t * t * v12
-    out[INFORMATION + 3, 3] = 0.5 * sum_ee * inverse - 0.25 * t * t * v22
+    out[px.INFORMATION + 2, 1] = sum_k * inverse + t * cov01
+    out[px.INFORMATION + 3, 1] = sum_ke * inverse - 0.5 * t * inverse * (totals[_V12Y] - v22)
+    out[px.INFORMATION + 2, 2] = n * inverse - t * t * v11
+    out[px.INFORMATION + 3, 2] = sum_e * inverse - 0.5 * t * t * v12
+    out[px.INFORMATION + 3, 3] = 0.5 * sum_ee * inverse - 0.25 * t * t * v22
 
 
 @kernel(borrows=True)
 def _fill_complete(n: float, of_exposure: float, inverse: float, out: FloatArray) -> None:
     """Fill the complete-data information, of parameters whose electron numbers are known; lower triangle."""
-    sums = out[SUMS]
-    out[DAMPING, 0] = of_exposure
+    sums = out[px.SUMS]
+    out[px.DAMPING, 0] = of_exposure
     for row in range(1, 4):
-        out[DAMPING + row, 0] = 0.0
-    out[DAMPING + 1, 1] = sums[SUM_KK] * inverse
-    out[DAMPING + 2, 1] = sums[SUM_K] * inverse
-    out[DAMPING + 2, 2] = n * inverse
-    out[DAMPING + 3, 1] = sums[SUM_KE] * inverse
-    out[DAMPING + 3, 2] = sums[SUM_E] * inverse
-    out[DAMPING + 3, 3] = 0.5 * sums[SUM_EE] * inverse
+        out[px.DAMPING + row, 0] = 0.0
+    out[px.DAMPING + 1, 1] = sums[px.SUM_KK] * inverse
+    out[px.DAMPING + 2, 1] = sums[px.SUM_K] * inverse
+    out[px.DAMPING + 2, 2] = n * inverse
+    out[px.DAMPING + 3, 1] = sums[px.SUM_KE] * inverse
+    out[px.DAMPING + 3, 2] = sums[px.SUM_E] * inverse
+    out[px.DAMPING + 3, 3] = 0.5 * sums[px.SUM_EE] * inverse
 
 
 @kernel(inline=True, borrows=True)
@@ -397,12 +368,12 @@ def _evaluate_sample(
     """Evaluate one sample with electrons at its (log H, 1/g, mu - centre, log sigma^2)."""
     facts, bins = pixel.facts[sample], pixel.bins[sample]
     log_exposure, a, origin, log_variance = own
-    n_bins, zero = int(facts[N_BINS]), origin - facts[FIRST]
+    n_bins, zero = int(facts[px.N_BINS]), origin - facts[px.FIRST]
     rows, coefficients = scratch.rows, scratch.coefficients
     exposure, inverse = math.exp(log_exposure), math.exp(-log_variance)
     j = max(0, math.floor(0.5 - zero / a))
     last = max(j, math.floor((n_bins - 1 - zero) / a + 0.5))
-    dropped = _DROPPED_ALONE if what == LOGLIK_ALONE else _DROPPED
+    dropped = _DROPPED_ALONE if what == px.LOGLIK_ALONE else _DROPPED
     half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last, dropped)
     if last - j + 2 > coefficients.shape[0]:  # finer than any gain that is looked for
         return -math.inf
@@ -413,7 +384,7 @@ def _evaluate_sample(
     _fill_levels(rows, scratch.log_factorials, comb, log_exposure, constant)
     _fill_coefficients(coefficients, rows, comb)
     _fill_blocks(rows, comb, n_blocks)
-    if what == LOGLIK_ALONE:
+    if what == px.LOGLIK_ALONE:
         return float(_loglik_alone(bins, comb, n_blocks, rows, coefficients, 0.0))
     if half == 1:
         sums_of_3(bins, comb, n_blocks, rows, coefficients)
@@ -425,8 +396,8 @@ def _evaluate_sample(
         sums_of_9(bins, comb, n_blocks, rows, coefficients)
     else:
         sums_of_any(bins, comb, n_blocks, rows, coefficients)
-    if what == EXPECTATIONS:
-        _loglik_alone(bins, comb, n_blocks, rows, coefficients, facts[N_FRAMES])
+    if what == px.EXPECTATIONS:
+        _loglik_alone(bins, comb, n_blocks, rows, coefficients, facts[px.N_FRAMES])
     _finish(facts, log_exposure, a, origin, inverse, rows[_TOTALS], out)
     return float(rows[_TOTALS, _LOGLIK])
 
@@ -437,23 +408,23 @@ def _evaluate_dark(
 ) -> float:
     """Evaluate a sample without electrons, one Gaussian."""
     facts, inverse = pixel.facts[j], math.exp(-log_variance)
-    n, deviation = facts[N_FRAMES], facts[MEAN] - bias
-    for row in range(N_ROWS):
-        for column in range(N_BLOCK):
+    n, deviation = facts[px.N_FRAMES], facts[px.MEAN] - bias
+    for row in range(px.N_ROWS):
+        for column in range(px.N_BLOCK):
             out[row, column] = 0.0
-    sum_e, sum_ee = n * deviation, n * (facts[VARIANCE] + deviation * deviation)
-    out[SUMS, SUM_E], out[SUMS, SUM_EE] = sum_e, sum_ee
-    out[SCORE, 2] = sum_e * inverse
-    out[SCORE, 3] = 0.5 * (sum_ee * inverse - n)
+    sum_e, sum_ee = n * deviation, n * (facts[px.VARIANCE] + deviation * deviation)
+    out[px.SUMS, px.SUM_E], out[px.SUMS, px.SUM_EE] = sum_e, sum_ee
+    out[px.SCORE, 2] = sum_e * inverse
+    out[px.SCORE, 3] = 0.5 * (sum_ee * inverse - n)
     _fill_complete(n, 0.0, inverse, out)
     for row in range(2, 4):
         for column in range(2, row + 1):
-            out[INFORMATION + row, column] = out[DAMPING + row, column]
+            out[px.INFORMATION + row, column] = out[px.DAMPING + row, column]
     if expect:
         sd = math.exp(0.5 * log_variance)
-        for i in range(int(facts[N_BINS])):
-            z = (facts[FIRST] + i - bias) / sd
-            pixel.bins[j, EXPECTED, i] = n * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
+        for i in range(int(facts[px.N_BINS])):
+            z = (facts[px.FIRST] + i - bias) / sd
+            pixel.bins[j, px.EXPECTED, i] = n * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
     loglik: float = -0.5 * (n * (LOG_2PI + log_variance) + sum_ee * inverse)
     return loglik
 
@@ -469,12 +440,12 @@ def evaluate_density(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratc
         out: out, the evaluation; lower triangles of the matrices.
     """
     n = pixel.facts.shape[0]
-    a, bias, log_variance = theta[n + STEP], theta[n + BIAS], theta[n + LOG_VARIANCE]
+    a, bias, log_variance = theta[n + px.STEP], theta[n + px.BIAS], theta[n + px.LOG_VARIANCE]
     loglik = 0.0
     for j in range(n):
-        own_bias = bias - pixel.facts[j, CENTRE]
-        if pixel.facts[j, DARK] > 0.0:
-            loglik += _evaluate_dark(pixel, j, own_bias, log_variance, what == EXPECTATIONS, out[j])
+        own_bias = bias - pixel.facts[j, px.CENTRE]
+        if pixel.facts[j, px.DARK] > 0.0:
+            loglik += _evaluate_dark(pixel, j, own_bias, log_variance, what == px.EXPECTATIONS, out[j])
         else:
             own = theta[j], a, own_bias, log_variance
             loglik += _evaluate_sample(pixel, j, own, what, scratch, out[j])

@@ -20,6 +20,7 @@ from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
+from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import (
     Cells,
     Component,
@@ -31,27 +32,7 @@ from pchem_pipeline.model.law.cells_numba import (
     resolve,
 )
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.pixel_numba import (
-    ADDED_EXPOSURE,
-    CLIP_HIGH,
-    CLIP_LOW,
-    DERIVATIVES,
-    EDGE,
-    EXPOSURE_FACTOR,
-    FIRST,
-    LOGLIK_ALONE,
-    MASS,
-    N_BINS,
-    N_BLOCK,
-    OWN,
-    SHARE,
-    SHARE_SLOPE,
-    SLOPES,
-    Pixel,
-    Scratch,
-    make_pixel,
-    make_scratch,
-)
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch, make_pixel, make_scratch
 
 _TOP_REACH = 12.0
 _SEEN = 7.5  # standard deviations within which samples are seen
@@ -76,7 +57,7 @@ def place_codes(
     whole = math.floor(value + 0.5)
     codes = Codes(value - whole, parts, n)
     n_whole = math.floor(codes.first + (n - 1) / parts + 0.5) + 1
-    pixel.facts[0, N_BINS], pixel.facts[0, FIRST] = float(n_whole), 0.0
+    pixel.facts[0, px.N_BINS], pixel.facts[0, px.FIRST] = float(n_whole), 0.0
     found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, whole, 0.0)
     resolve(law, index, satellites[index, 0], found)
     return found, codes
@@ -103,7 +84,7 @@ def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes, reach: float) -
     low, high = codes.n, 0
     nearest = math.inf
     for peak in range(cells.n_peaks):
-        if cells.peaks[SHARE, peak] == 0.0 and cells.peaks[SHARE_SLOPE, peak] == 0.0:
+        if cells.peaks[px.SHARE, peak] == 0.0 and cells.peaks[px.SHARE_SLOPE, peak] == 0.0:
             continue
         part = component(float(k), peak, theta, cells, REACH)
         width = min(FARTHEST, max(reach, theta[1] / part.sd)) * part.sd + 0.5 + cells.margin
@@ -127,8 +108,8 @@ def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, l
     cells = cells_of(pixel, 0)
     factor = added = 0.0
     for i in range(cells.mixtures.shape[1]):
-        factor = max(factor, cells.mixtures[EXPOSURE_FACTOR, i])
-        added = max(added, cells.mixtures[ADDED_EXPOSURE, i])
+        factor = max(factor, cells.mixtures[px.EXPOSURE_FACTOR, i])
+        added = max(added, cells.mixtures[px.ADDED_EXPOSURE, i])
     margin = 1.0
     row = index if law.edge_shift.shape[1] > 1 else 0
     for i in range(law.edge_shift.shape[2]):
@@ -145,7 +126,7 @@ def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, l
             low, high = min(low, part.mean - reach), max(high, part.mean + reach)
         k += 1
     facts = pixel.facts[0]
-    bottom, top = facts[CLIP_LOW] - pixel.centre, facts[CLIP_HIGH] - pixel.centre
+    bottom, top = facts[px.CLIP_LOW] - pixel.centre, facts[px.CLIP_HIGH] - pixel.centre
     low, high = min(max(low, bottom), top), max(min(high, top), bottom)
     return math.floor(low), math.ceil(high)
 
@@ -155,7 +136,7 @@ def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int
     """Add the mass of whole codes to the first row of ``share``; the second gets the tails at their edges."""
     mean, inverse = part.mean, 1.0 / part.sd
     for i in range(low, high + 1, SIMD_WIDTH):
-        tail, _, _ = simd_tail((simd_load(cells.bins, EDGE, i) - mean) * inverse)
+        tail, _, _ = simd_tail((simd_load(cells.bins, px.EDGE, i) - mean) * inverse)
         simd_store(share, 1, i - low, tail)
     for i in range(0, high - low, SIMD_WIDTH):
         inside = simd_load(share, 1, i + 1) - simd_load(share, 1, i)
@@ -198,7 +179,7 @@ def fill_level(
     for i in range(high - low):
         share[0, i] = 0.0
     for peak in range(cells.n_peaks if low < high else 0):
-        weight = cells.peaks[SHARE, peak] + theta[4] * cells.peaks[SHARE_SLOPE, peak]
+        weight = cells.peaks[px.SHARE, peak] + theta[4] * cells.peaks[px.SHARE_SLOPE, peak]
         if weight == 0.0:
             continue
         part = component(float(k), peak, theta, cells, REACH)
@@ -209,7 +190,7 @@ def fill_level(
             value = codes.first + i / codes.parts
             whole = math.floor(value + 0.5)
             aside = value - whole
-            lower, upper = cells.bins[EDGE, whole] + aside, cells.bins[EDGE, whole + 1] + aside
+            lower, upper = cells.bins[px.EDGE, whole] + aside, cells.bins[px.EDGE, whole + 1] + aside
             inside = normal_mass((lower - part.mean) / part.sd, (upper - part.mean) / part.sd)
             share[0, i - low] += weight * inside
     return low, max(low, high)
@@ -241,7 +222,7 @@ def known_theta(parameters: FloatArray, centre: int, weight: float, theta: Float
 def find_reach(parameters: FloatArray, satellites: FloatArray, law: Law, out: IntArray) -> None:
     """Fill the first and last code that each pixel shows, DN, shape (n, 2); (0, -1) without parameters."""
     pixel, scratch = pixel_scratch(2, law)
-    theta = scratch.small[OWN]
+    theta = scratch.small[px.OWN]
     for p in range(parameters.shape[0]):
         out[p, 0], out[p, 1] = 0, -1
         placed, _ = place_codes(p, 0, 1, 1, law, satellites, pixel)
@@ -273,8 +254,8 @@ def mass_tile(
     """
     n_codes = out.shape[1]
     room, scratch = pixel_scratch(n_codes, law)
-    theta, what = scratch.small[OWN], DERIVATIVES if slopes.shape[0] > 0 else LOGLIK_ALONE
-    room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_codes), 0.0
+    theta, what = scratch.small[px.OWN], px.DERIVATIVES if slopes.shape[0] > 0 else px.LOGLIK_ALONE
+    room.facts[0, px.N_BINS], room.facts[0, px.FIRST] = float(n_codes), 0.0
     for index in range(parameters.shape[0]):
         if not known_theta(parameters[index], first[index], satellites[index, 1], theta):
             continue
@@ -283,7 +264,7 @@ def mass_tile(
         cells = cells_of(pixel, 0)
         fill_masses(theta, cells, stage, what, scratch.numbers, scratch.edges, scratch.cells[0])
         for i in range(n_codes):
-            out[index, i] = scratch.cells[0, MASS, i]
-        for j in range(N_BLOCK - 1 if slopes.shape[0] > 0 else 0):
+            out[index, i] = scratch.cells[0, px.MASS, i]
+        for j in range(px.N_BLOCK - 1 if slopes.shape[0] > 0 else 0):
             for i in range(n_codes):
-                slopes[index, j, i] = scratch.cells[0, SLOPES + j, i]
+                slopes[index, j, i] = scratch.cells[0, px.SLOPES + j, i]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH
 
@@ -148,6 +148,7 @@ class Scratch(NamedTuple):
         small: vectors and matrices, shape (N_SMALL, J + N_SHARED).
         flags: parameters that stay, shape (2, J + N_SHARED).
         evaluations: shape (3, J, N_ROWS, N_BLOCK).
+        used: how many evaluations a pixel has taken, shape (1,).
     """
 
     rows: FloatArray
@@ -159,6 +160,7 @@ class Scratch(NamedTuple):
     small: FloatArray
     flags: BoolArray
     evaluations: FloatArray
+    used: IntArray
 
 
 @kernel
@@ -185,6 +187,7 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
         np.zeros((N_SMALL, n_samples + N_SHARED)),
         np.zeros((2, n_samples + N_SHARED), np.bool_),
         np.zeros((3, n_samples, N_ROWS, N_BLOCK)),
+        np.zeros(1, np.int64),
     )
 
 
