@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -433,14 +434,19 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
     taps: Count = Field(
         default=1, ge=1, le=4096, description="column blocks read in parallel, with independent noise"
     )
+    rows: Count | None = Field(
+        default=None, ge=1, description="rows of a frame, of which these may be a part; null: these are all"
+    )
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with as many taps as these columns have of its width."""
-        return self._with_taps((columns[1] - columns[0]) / shape[1])
+        """Return it with as many taps as these columns have of its width, in frames of all rows."""
+        taps = self._with_taps((columns[1] - columns[0]) / shape[1])
+        return taps.model_copy(update={"rows": self.rows or shape[0]})
 
     def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with taps of the same width on all columns; one tap is one whatever the window."""
-        return self if self.taps == 1 else self._with_taps(shape[1] / (columns[1] - columns[0]))
+        whole = self.model_copy(update={"rows": None})
+        return whole if self.taps == 1 else whole._with_taps(shape[1] / (columns[1] - columns[0]))
 
     def _with_taps(self, factor: float) -> Self:
         return self.model_copy(update={"taps": max(round(self.taps * factor), 1)})
@@ -454,11 +460,19 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         width = -(-columns // taps)
         amplitudes = pink_amplitudes(rows * width, _RECORD)
         noise = np.empty((context.frames.size, context.rows.size, columns))
+        # waves longer than these rows, one by one: cycles per frame, and shares of the variance
+        whole = max(self.rows or rows, rows)
+        cycles = np.arange(_RECORD, _RECORD * whole // rows) / _RECORD
+        shares = 1.0 / (cycles * (0.5 + _RECORD * math.log(max(whole * width / 2.0, 1.0))))
+        angles = math.tau * np.outer(cycles, np.arange(rows)) / whole
+        waves = np.concatenate([np.cos(angles), np.sin(angles)]) * np.sqrt(np.tile(shares, 2))[:, None]
+        rest = math.sqrt(max(1.0 - float(shares.sum()), 0.0))
         for t, frame in enumerate(context.frames):
             random = context.random.generator(frame=int(frame))
             white = np.fft.rfft(random.standard_normal((taps, _RECORD * rows * width)))
             record = np.fft.irfft(amplitudes * white, _RECORD * rows * width)
-            series = record[:, : rows * width].reshape(taps, rows, width)
+            series = rest * record[:, : rows * width].reshape(taps, rows, width)
+            series += (random.standard_normal((taps, len(waves))) @ waves)[:, :, None]
             noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
         noise *= self.noise_dn
         return noise

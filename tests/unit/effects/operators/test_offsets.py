@@ -114,6 +114,16 @@ def test_its_spectrum_falls_along_the_samples_of_a_tap(taps):
         assert abs(np.mean(first * other)) < 5 * 4.0 / np.sqrt(600)
 
 
+def test_some_rows_of_a_frame_have_its_slow_noise():
+    effect, frames = ReadOrderNoise(noise_dn=2.0), 4000
+    whole = offsets(effect, context_of((64, 6), frames))[:, 24:32]
+    part = offsets(effect.to_window((24, 32), (0, 6), (64, 6)), context_of((8, 6), frames))
+    error = 5 * np.sqrt(4 / frames)
+    assert part.mean(axis=(1, 2)).var() == pytest.approx(whole.mean(axis=(1, 2)).var(), rel=error)
+    assert part.var() == pytest.approx(whole.var(), rel=error)
+    assert effect.to_window((24, 32), (0, 6), (64, 6)).to_sensor((24, 32), (0, 6), (64, 6)) == effect
+
+
 # one tap, one tap, four
 @pytest.mark.parametrize("seed", [180000, 180001, 180003])
 def test_an_independent_camera_s_noise_is_among_the_guesses(seed):
