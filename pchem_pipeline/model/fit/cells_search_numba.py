@@ -80,20 +80,20 @@ def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray)
     )
     left = frames = 0.0
     for j in range(n):
-        facts, k = pixel.facts[j], math.exp(near[j])
-        if facts[px.DARK] > 0.0:
+        facts, law, k = pixel.facts[j], pixel.laws[j], math.exp(near[j])
+        if facts.dark:
             k = 0.0
         elif not warm:
             exposure = k
             for i in range(pixel.mixtures.shape[2]):
                 exposure -= pixel.mixtures[j, px.ADDED_WEIGHT, i] * pixel.mixtures[j, px.ADDED_EXPOSURE, i]
             theta[j] = math.log(max(exposure, _LEAST_SHARE * k))
-        spread = facts[px.EXTRA_E2] + k * (facts[px.PER_ELECTRON] + k * facts[px.PER_ELECTRON2])
+        spread = law.extra_e2 + k * (law.per_electron + k * law.per_electron2)
         own = 0.0
-        for i in range(int(facts[px.N_PEAKS])):
+        for i in range(facts.n_peaks):
             own += pixel.peaks[j, px.SHARE, i] * pixel.peaks[j, px.WIDTH, i] ** 2
-        left += facts[px.N_FRAMES] * (analog2 - a * a * spread - facts[px.EXTRA_DN2]) / own
-        frames += facts[px.N_FRAMES]
+        left += facts.n_frames * (analog2 - a * a * spread - law.extra_dn2) / own
+        frames += facts.n_frames
     if not warm:
         analog2 = max(left / frames, _LEAST_SHARE * analog2)
     theta[n + px.LOG_VARIANCE] = math.log(analog2)
@@ -106,10 +106,10 @@ def _share_at_limits(pixel: Pixel) -> float:
     largest = 0.0
     for j in range(pixel.facts.shape[0]):
         facts, found = pixel.facts[j], 0.0
-        for i in range(int(facts[px.N_BINS])):
-            if i <= facts[px.BOTTOM] or i + 1 >= facts[px.TOP]:
+        for i in range(facts.n_bins):
+            if i <= facts.bottom or i + 1 >= facts.top:
                 found += pixel.bins[j, px.WEIGHT, i]
-        largest = max(largest, found / facts[px.N_FRAMES])
+        largest = max(largest, found / facts.n_frames)
     return largest
 
 
@@ -123,15 +123,15 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> None:
     trial, place = tools.scratch.small[px.HERE], 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, px.CUMULATIVE]
     no_starts(tools.scratch.small[px.HEIGHTS])
-    while cumulative[place + 1] < 0.5 * facts[px.N_FRAMES]:
+    while cumulative[place + 1] < 0.5 * facts.n_frames:
         place += 1
-    a, least = facts[px.N_BINS] + 1.0, max(0.25 * math.sqrt(facts[px.VARIANCE]), LEAST_STEP)
+    a, least = facts.n_bins + 1.0, max(0.25 * math.sqrt(facts.variance), LEAST_STEP)
     while a > least:
         for exposure in _CUT_EXPOSURES:
             middle = max(exposure - 0.3, 0.0)  # e-: the median of the electrons, to a third
             for around in range(-_AROUND, _AROUND + 1):
                 trial[0], trial[1 + px.STEP], trial[1 + px.SATELLITE] = math.log(exposure), a, 0.0
-                trial[1 + px.BIAS] = facts[px.FIRST] + place - a * (middle + around / _STEPS)
+                trial[1 + px.BIAS] = facts.first + place - a * (middle + around / _STEPS)
                 trial[1 + px.LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
                 keep_start(pixel, tools.evaluate, True, tools.scratch)
         a /= _CUT_RATIO

@@ -14,7 +14,7 @@ from pchem_pipeline.model.fit import cells_search_numba, climb_numba, search_num
 from pchem_pipeline.model.fit.climb_numba import Goal, Limits
 from pchem_pipeline.model.law import cells_numba, density_numba
 from pchem_pipeline.model.law.inputs import pack
-from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
+from pchem_pipeline.model.law.pixel_numba import FACTS, LAW, Pixel, Scratch
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _VECTOR = np.zeros(1)
@@ -32,7 +32,7 @@ def _address(result: Any, arguments: tuple[Any, ...]) -> Any:
 def _evaluation_arguments() -> tuple[Any, ...]:
     """Return an example of each argument of a likelihood."""
     rows, stack = np.zeros((1, 1)), np.zeros((1, 1, 1))
-    pixel = Pixel(stack, rows, stack, stack, 0, 0.0)
+    pixel = Pixel(stack, np.zeros(1, FACTS), np.zeros(1, LAW), stack, stack, 0, 0.0)
     flags, evaluations, used = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1)), np.zeros(1, np.int64)
     scratch = Scratch(rows, rows, rows, rows, stack, rows, rows, flags, evaluations, used)
     return pixel, _VECTOR, 0, scratch, stack

@@ -111,8 +111,8 @@ def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
     """Return the nats that peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring: ``N r^2``."""
     n, frames = pixel.facts.shape[0], 0.0
     for j in range(n):
-        if pixel.facts[j, px.DARK] == 0.0:
-            frames += pixel.facts[j, px.N_FRAMES]
+        if not pixel.facts[j].dark:
+            frames += pixel.facts[j].n_frames
     noise2 = math.exp(best[n + px.LOG_VARIANCE]) / best[n + px.STEP] ** 2
     return frames * math.exp(-4.0 * math.pi**2 * noise2)
 
@@ -122,7 +122,7 @@ def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
     """Return the largest exposure of a pixel's samples, e-."""
     most = 0.0
     for j in range(pixel.facts.shape[0]):
-        if pixel.facts[j, px.DARK] == 0.0:
+        if not pixel.facts[j].dark:
             most = max(most, math.exp(theta[j]))
     return most
 
@@ -136,9 +136,9 @@ def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     n = pixel.facts.shape[0]
     if n == 1:
         return 4 if cells and not theta[n + px.STEP] > FEW_STEP else 2
-    frames = pixel.facts[0, px.N_FRAMES]
+    frames = pixel.facts[0].n_frames
     for j in range(n):
-        frames = min(frames, pixel.facts[j, px.N_FRAMES])
+        frames = min(frames, pixel.facts[j].n_frames)
     reach = 3.0 * math.sqrt(2.0 / frames) * _most_electrons(pixel, theta)
     return 4 + 2 * int(min(reach, _MOST_STEPS))
 
@@ -205,8 +205,8 @@ def loglik_without_gain(pixel: Pixel) -> float:
     """Return the log-likelihood of Gaussians of one width, each at the mean of its sample: g to infinity."""
     n = square = 0.0
     for j in range(pixel.facts.shape[0]):
-        n += pixel.facts[j, px.N_FRAMES]
-        square += pixel.facts[j, px.N_FRAMES] * pixel.facts[j, px.VARIANCE]
+        n += pixel.facts[j].n_frames
+        square += pixel.facts[j].n_frames * pixel.facts[j].variance
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(square / n, QUANTISATION_VARIANCE)))
 
 
@@ -220,9 +220,9 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
     """
     facts, weights, trial = pixel.facts[0], pixel.bins[0, px.WEIGHT], scratch.small[px.HERE]
     third = 0.0
-    for i in range(int(facts[px.N_BINS])):
-        third += weights[i] * (facts[px.FIRST] + i - facts[px.MEAN]) ** 3
-    skewness = max(third / facts[px.N_FRAMES] / facts[px.VARIANCE] ** 1.5, _LEAST_SKEWNESS)
+    for i in range(facts.n_bins):
+        third += weights[i] * (facts.first + i - facts.mean) ** 3
+    skewness = max(third / facts.n_frames / facts.variance**1.5, _LEAST_SKEWNESS)
     low, high = 2.0 * _BLURRED2, 4.0 / skewness**2 + 10.0
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
@@ -230,9 +230,9 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
             low = middle
         else:
             high = middle
-    a = math.sqrt(facts[px.VARIANCE] / (low + _BLURRED2))
+    a = math.sqrt(facts.variance / (low + _BLURRED2))
     rounding = QUANTISATION_VARIANCE if cells else 0.0
-    trial[0], trial[1 + px.STEP], trial[1 + px.BIAS] = math.log(low), a, facts[px.MEAN] - low * a
+    trial[0], trial[1 + px.STEP], trial[1 + px.BIAS] = math.log(low), a, facts.mean - low * a
     trial[1 + px.LOG_VARIANCE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01))
     trial[1 + px.SATELLITE] = 0.0
     loglik: float = evaluate(pixel, trial, px.LOGLIK_ALONE, scratch, scratch.evaluations[px.AT])
@@ -248,8 +248,8 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     n = pixel.facts.shape[0]
     most = 0.0
     for j in range(n):
-        if pixel.facts[j, px.DARK] == 0.0:
-            most = max(most, pixel.facts[j, px.N_FRAMES])
+        if not pixel.facts[j].dark:
+            most = max(most, pixel.facts[j].n_frames)
     noise2 = math.exp(theta[n + px.LOG_VARIANCE]) / theta[n + px.STEP] ** 2
     return math.sqrt(most) * math.exp(-2.0 * math.pi**2 * noise2)
 
@@ -335,11 +335,11 @@ def goodness(pixel: Pixel) -> tuple[float, int]:
     chi2, freedom = 0.0, 1 - FITTED_PARAMETERS
     for j in range(pixel.facts.shape[0]):
         bins, facts = pixel.bins[j], pixel.facts[j]
-        own, degrees = pearson(bins[px.WEIGHT], bins[px.EXPECTED], int(facts[px.N_BINS]), facts[px.N_FRAMES])
+        own, degrees = pearson(bins[px.WEIGHT], bins[px.EXPECTED], facts.n_bins, facts.n_frames)
         if degrees > 0:
             chi2 += own
             freedom += degrees + FITTED_PARAMETERS
-            if facts[px.DARK] == 0.0:
+            if not facts.dark:
                 freedom -= 1
     if freedom <= 0:
         return math.nan, 0
@@ -352,7 +352,7 @@ def outlying(pixel: Pixel, floor: float) -> float:
     found = 0.0
     for j in range(pixel.facts.shape[0]):
         bins = pixel.bins[j]
-        for i in range(int(pixel.facts[j, px.N_BINS])):
+        for i in range(pixel.facts[j].n_bins):
             if bins[px.EXPECTED, i] < floor:
                 found += bins[px.WEIGHT, i]
     return found
@@ -397,7 +397,7 @@ def judge(
     sigma, a = math.exp(0.5 * best[n + px.LOG_VARIANCE]), best[n + px.STEP]
     at_bound = True
     for j in range(n):
-        at_bound = at_bound and (pixel.facts[j, px.DARK] > 0.0 or best[j] <= limits.bound + 1e-9)
+        at_bound = at_bound and (pixel.facts[j].dark or best[j] <= limits.bound + 1e-9)
     if above_null < limits.gap:
         status |= GAIN_NOT_IDENTIFIED
     if gap < limits.gap:
@@ -413,7 +413,7 @@ def judge(
     if n > 1 and limits.cells and sigma < _COARSE_NOISE and 1.0 / a > 0.5 - NEAR_TWO:
         status |= GAIN_AMBIGUOUS  # combs with the same codes are looked for in single samples only
     if n == 1:
-        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, px.OCCUPIED] < _FEWEST_CODES):
+        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0].occupied < _FEWEST_CODES):
             status |= GAIN_AMBIGUOUS
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)
@@ -526,7 +526,7 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
     at_best = examine(pixel, tools, best, out)
     if n == 1 and not tools.limits.cells:
         good, _ = settled(pixel, best, clear, math.inf, out)
-        expected = expected_gap(pixel.facts[0, px.N_FRAMES], best)
+        expected = expected_gap(pixel.facts[0].n_frames, best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
         if good and out[DEGREES] > 0.0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
             return Found(at_best, max(runner_up, at_best - expected), found.degenerate)

@@ -34,10 +34,10 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     Scratch,
     copy,
-    histogram_of,
     load,
     make_pixel,
     make_scratch,
+    sample_of,
 )
 
 # columns of `words`
@@ -92,9 +92,9 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
         own += given.origin[index, j]
         if j == 0:
             centre = own
-        room.facts[j, px.CENTRE] = float(own - centre)
-        widest = max(widest, room.facts[j, px.N_BINS])
-    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
+        room.facts[j].centre = float(own - centre)
+        widest = max(widest, room.facts[j].n_bins)
+    return Pixel(room.bins, room.facts, room.laws, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
 
 
 @kernel(borrows=True)
@@ -103,15 +103,15 @@ def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float,
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        n += facts[px.N_FRAMES]
-        least = min(least, facts[px.N_FRAMES])
-        if facts[px.DARK] == 0.0:
-            occupied = max(occupied, facts[px.OCCUPIED])
-        if facts[px.N_FRAMES] > 0.0:
-            moments[j, 0] = pixel.centre + facts[px.CENTRE] + facts[px.MEAN]
-            moments[j, 1] = facts[px.VARIANCE]
-            first = pixel.centre + int(facts[px.CENTRE] + facts[px.FIRST])
-            lowest, highest = min(lowest, first), max(highest, first + int(facts[px.N_BINS]) - 1)
+        n += facts.n_frames
+        least = min(least, facts.n_frames)
+        if not facts.dark:
+            occupied = max(occupied, facts.occupied)
+        if facts.n_frames > 0.0:
+            moments[j, 0] = pixel.centre + facts.centre + facts.mean
+            moments[j, 1] = facts.variance
+            first = pixel.centre + int(facts.centre + facts.first)
+            lowest, highest = min(lowest, first), max(highest, first + facts.n_bins - 1)
     words[LOWEST_DN], words[HIGHEST_DN], words[FRAMES] = lowest, highest, int(n)
     return least, occupied
 
@@ -127,7 +127,7 @@ def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatA
     if not math.isfinite(known):
         return False
     for j in range(n):
-        dark = pixel.facts[j, px.DARK] > 0.0 or not parameters[j] > 0.0
+        dark = pixel.facts[j].dark or not parameters[j] > 0.0
         theta[j] = limits.bound if dark else math.log(parameters[j])
     theta[n + px.STEP] = 1.0 / parameters[n]
     theta[n + px.BIAS] = parameters[n + 1] - pixel.centre
@@ -177,9 +177,9 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
     theta = scratch.small[px.HERE]
     for index in range(given.counts.shape[0]):
         pixel = load_pixel(given, index, room)
-        if pixel.facts[0, px.OCCUPIED] < 3:
+        if pixel.facts[0].occupied < 3:
             continue
-        if start_regression(histogram_of(pixel, 0), basis, scratch.rows, theta)[0]:
+        if start_regression(sample_of(pixel, 0), basis, scratch.rows, theta)[0]:
             parameters[index, 0] = math.exp(theta[0])
             parameters[index, 1] = 1.0 / theta[1 + px.STEP]
             parameters[index, 2] = theta[1 + px.BIAS] + pixel.centre
