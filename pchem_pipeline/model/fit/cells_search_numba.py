@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -15,14 +16,9 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
-    AMPLITUDE,
     CLEAR_GAP,
-    DEGREES,
     FIT_NOT_CONVERGED,
-    GAP,
-    LOG_LIKELIHOOD,
     NEAR_TWO,
-    SATELLITE_WEIGHT,
     SURELY_SEEN,
     SUSPICIOUS,
     Found,
@@ -138,7 +134,7 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> None:
 
 
 @kernel(borrows=True)
-def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, found: Found) -> Found:
+def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: Any, found: Found) -> Found:
     """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
@@ -182,7 +178,7 @@ def _start_anew(
     score: float,
     gap: float,
     best: FloatArray,
-    out: FloatArray,
+    out: Any,
     found: Found,
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
@@ -216,7 +212,7 @@ def _start_anew(
 
 @kernel
 def _try_satellites(
-    pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: FloatArray, found: Found
+    pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: Any, found: Found
 ) -> Found:
     """Try free satellites of each amplitude; ``out`` is that of the fit with those that are kept."""
     n = pixel.facts.shape[0]
@@ -227,17 +223,15 @@ def _try_satellites(
     )
     loglik = examine(pixel, tools, best, out)
     if amplitude > 0.0:
-        out[DEGREES] = max(out[DEGREES] - 2.0, 0.0)
-    out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + px.SATELLITE]
+        out.freedom = max(out.freedom - 2, 0)
+    out.amplitude, out.weight = amplitude, best[n + px.SATELLITE]
     return Found(loglik, found.runner_up, found.degenerate)
 
 
-def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
+def search_with(satellites: bool) -> Callable[..., int]:
     """Make the search; ``satellites``: with what tries free ones."""
 
-    def search_cells(
-        pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
-    ) -> tuple[int, int, int]:
+    def search_cells(pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: Any) -> int:
         """Find the most likely parameters of one pixel with its cells integrated, under any law.
 
         From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
@@ -250,7 +244,7 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         gap, score = task.gap if known else math.inf, math.inf
         best[n + px.STEP] = 0.0
         tools.scratch.flags[px.FIXED, n + px.SATELLITE] = True
-        out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
+        out.amplitude = out.weight = 0.0
         found = Found(-math.inf, -math.inf, np.bool_(False))
         at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
         cut = n == 1 and at_limits
@@ -267,7 +261,9 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
             found = Found(loglik, runner_up, found.degenerate)
         found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
         if not best[n + px.STEP] > 0.0:
-            return FIT_NOT_CONVERGED, tools.scratch.used[0], 0
+            out.freedom = 0
+            out.evaluations += tools.scratch.used[0]
+            return FIT_NOT_CONVERGED
         bias_gap = min(gap, found.loglik - found.runner_up)
         blurred = math.inf
         if n == 1 and not (limits.warm or limits.reshapes):
@@ -275,7 +271,8 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         gap = min(bias_gap, found.loglik - null, blurred)
         if satellites and task.amplitudes.size > 0:
             found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
-        out[LOG_LIKELIHOOD], out[GAP], used = found.loglik, gap, tools.scratch.used[0]
+        out.log_likelihood, out.gap = found.loglik, gap
+        out.evaluations += tools.scratch.used[0]
         # the density has told whether there is a gain: it knows no other law than one Gaussian does
         above_null = math.inf if known else found.loglik - null
         of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
@@ -286,6 +283,6 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
             unsure = bias_gap < limits.gap
         of_gain = of_gain or (at_limits and unsure)
         word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
-        return word, used, int(out[DEGREES])
+        return int(word)
 
     return search_cells

@@ -27,9 +27,24 @@ EXPOSURE_AT_BOUND, BIAS_AMBIGUOUS = int(FitStatus.EXPOSURE_AT_BOUND), int(FitSta
 NOT_INFORMATIVE, COARSE_STEPS = int(FitStatus.NOT_INFORMATIVE), int(FitStatus.COARSE_STEPS)
 GAIN_AMBIGUOUS = int(FitStatus.GAIN_AMBIGUOUS)
 
-# columns of a row of results
-LOG_LIKELIHOOD, GAP, CHI2, DEGREES, OUTLYING, AMPLITUDE, SATELLITE_WEIGHT = range(7)
-N_OUT = 7
+#: What a search, and the loop over the pixels, finds of one beside its parameters.
+RESULT = np.dtype(
+    [
+        ("status", "i8"),
+        ("evaluations", "i8"),
+        ("lowest_dn", "i8"),
+        ("highest_dn", "i8"),
+        ("frames", "i8"),
+        ("log_likelihood", "f8"),
+        ("gap", "f8"),  # nats to the runner-up
+        ("chi2", "f8"),
+        ("freedom", "i8"),
+        ("outlying", "f8"),  # samples where none are expected
+        ("amplitude", "f8"),  # of free satellites, e-
+        ("weight", "f8"),
+    ],
+    align=True,
+)
 
 CLEAR_GAP = 30.0  # nats: a neighbour this far below is not climbed to the end
 SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
@@ -255,9 +270,7 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
 
 
 @kernel(borrows=True)
-def settled(
-    pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: FloatArray
-) -> tuple[bool, bool]:
+def settled(pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: Any) -> tuple[bool, bool]:
     """Return whether a maximum fits well, its gain settled, and whether others may be higher.
 
     They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all
@@ -267,8 +280,8 @@ def settled(
     n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
     good = score_of(out) < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
     good = good and (n > 1 or above_null > CLEAR_GAP)
-    misfit = math.sqrt(out[CHI2] / max(out[DEGREES], 1.0))
-    of_the_model = n == 1 and out[DEGREES] > 0.0 and lobe > _SURE_LOBE * misfit
+    misfit = math.sqrt(out.chi2 / max(out.freedom, 1))
+    of_the_model = n == 1 and out.freedom > 0 and lobe > _SURE_LOBE * misfit
     return good, not (good or of_the_model)
 
 
@@ -359,21 +372,20 @@ def outlying(pixel: Pixel, floor: float) -> float:
 
 
 @kernel(borrows=True)
-def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> float:
+def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: Any) -> float:
     """Evaluate at a maximum, into `AT_BEST`; fill goodness of fit and outliers; return the log-likelihood."""
     scratch = tools.scratch
     loglik: float = tools.evaluate(pixel, theta, px.EXPECTATIONS, scratch, scratch.evaluations[px.AT_BEST])
     scratch.used[0] += 1
-    out[OUTLYING] = outlying(pixel, tools.limits.floor)
-    out[CHI2], freedom = goodness(pixel)
-    out[DEGREES] = float(freedom)
+    out.outlying = outlying(pixel, tools.limits.floor)
+    out.chi2, out.freedom = goodness(pixel)
     return loglik
 
 
 @kernel(borrows=True)
-def score_of(out: FloatArray) -> float:
+def score_of(out: Any) -> float:
     """Return the goodness of fit in a row of results as a standard normal deviate."""
-    score: float = normal_score(out[CHI2], int(out[DEGREES]))
+    score: float = normal_score(out.chi2, out.freedom)
     return score
 
 
@@ -520,7 +532,7 @@ def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -
 
 
 @kernel(borrows=True)
-def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray) -> Found:
+def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: Any) -> Found:
     """Examine a new best maximum and, unless the fit rules them out, its neighbours; keep the likeliest."""
     n, loglik, runner_up = pixel.facts.shape[0], found.loglik, found.runner_up
     at_best = examine(pixel, tools, best, out)
@@ -528,7 +540,7 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
         good, _ = settled(pixel, best, clear, math.inf, out)
         expected = expected_gap(pixel.facts[0].n_frames, best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
-        if good and out[DEGREES] > 0.0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
+        if good and out.freedom > 0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
             return Found(at_best, max(runner_up, at_best - expected), found.degenerate)
     higher, beside = climb_neighbours(pixel, tools, best, loglik)
     if higher > loglik:
@@ -538,13 +550,7 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
 
 @kernel(borrows=True)
 def _climb_start(
-    pixel: Pixel,
-    tools: Tools,
-    clear: bool,
-    found: Found,
-    trial: FloatArray,
-    best: FloatArray,
-    out: FloatArray,
+    pixel: Pixel, tools: Tools, clear: bool, found: Found, trial: FloatArray, best: FloatArray, out: Any
 ) -> Found:
     """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
@@ -571,9 +577,7 @@ def _climb_start(
 
 
 @kernel(borrows=True)
-def climb_starts(
-    pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
-) -> Found:
+def climb_starts(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: Any) -> Found:
     """Climb from the starts, the highest first; a higher maximum takes the place of ``best``."""
     trial = tools.scratch.small[px.HERE]
     while next_start(tools.scratch, trial):
@@ -582,9 +586,7 @@ def climb_starts(
 
 
 @kernel(borrows=True)
-def _stay_near(
-    pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
-) -> tuple[bool, float]:
+def _stay_near(pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: Any) -> tuple[bool, float]:
     """Climb from what is known; return whether that fits well, and its log-likelihood."""
     copy(task.near, trial)
     outcome, loglik = climb_on(pixel, tools, from_start(), trial, trial)
@@ -594,36 +596,27 @@ def _stay_near(
     return score_of(out) < SUSPICIOUS, loglik
 
 
-def search_density(
-    pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
-) -> tuple[int, int, int]:
+def search_density(pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: Any) -> int:
     """Find the most likely parameters of one pixel with the density.
 
     Where an answer is known to be near, the maximum next to it is taken as long as it fits well. Otherwise
     the first start is climbed from; where the goodness of fit or a side lobe in the noise raises suspicion,
     the other starts follow; the likeliest maximum is kept.
 
-    ``best`` becomes theta at the maximum, its step 0 where there is none, ``out`` a row of results, see
-    `LOG_LIKELIHOOD`; score and information at the maximum are in `AT_BEST`.
-
-    Returns:
-        Status word, evaluations, degrees of freedom of the goodness of fit.
+    ``best`` becomes theta at the maximum, its step 0 where there is none, ``out`` is filled, see `RESULT`;
+    score and information at the maximum are in `AT_BEST`. Return the status word.
     """
-    n, trial, limits, used = (
-        pixel.facts.shape[0],
-        tools.scratch.small[px.HERE],
-        tools.limits,
-        tools.scratch.used,
-    )
-    heights, null = tools.scratch.small[px.HEIGHTS], loglik_without_gain(pixel)
+    n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
+    used, trial, heights = tools.scratch.used, tools.scratch.small[px.HERE], tools.scratch.small[px.HEIGHTS]
     best[n + px.STEP] = 0.0
     if task.near[n + px.STEP] > 0.0:
         fits, loglik = _stay_near(pixel, tools, task, trial, out)
         if fits:
             copy(trial, best)
-            out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
+            out.log_likelihood, out.gap = loglik, min(task.gap, loglik - null)
             word = judge(pixel, limits, best, loglik - null, math.inf, math.inf, False)
-            return word, used[0], int(out[DEGREES])
+            out.evaluations += used[0]
+            return int(word)
     found = Found(-math.inf, -math.inf, np.bool_(False))
     for attempt in range(N_ATTEMPTS):
         clear = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
@@ -643,12 +636,14 @@ def search_density(
             break
         if limits.quick and found.loglik - null > limits.gap:
             break
+    out.evaluations += used[0]
     if not best[n + px.STEP] > 0.0:
-        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, used[0], 0
-    out[LOG_LIKELIHOOD], count = found.loglik, used[0]
+        out.freedom = 0
+        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED
+    out.log_likelihood = found.loglik
     blurred = above_blurred(pixel, tools, best, found.loglik)
-    out[GAP] = min(found.loglik - max(found.runner_up, null), blurred)
+    out.gap = min(found.loglik - max(found.runner_up, null), blurred)
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.runner_up)
     gap = found.loglik - found.runner_up
     word = judge(pixel, limits, best, found.loglik - null, blurred, gap, of_gain)
-    return word, count, int(out[DEGREES])
+    return int(word)

@@ -18,7 +18,6 @@ from pchem_pipeline.model.fit.climb_numba import Limits, min_log_variance
 from pchem_pipeline.model.fit.search_numba import (
     FIT_NOT_CONVERGED,
     GAIN_AMBIGUOUS,
-    LOG_LIKELIHOOD,
     NO_DATA,
     SURELY_SEEN,
     TOO_FEW_BINS,
@@ -39,10 +38,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_scratch,
     sample_of,
 )
-
-# columns of `words`
-STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN, FRAMES = range(6)
-N_WORDS = 6
 
 
 class Histograms(NamedTuple):
@@ -78,8 +73,7 @@ class Answers(NamedTuple):
     parameters: FloatArray  # (H_1 ... H_J, g, mu, sigma), shape (n, J + 3); comes as NaN
     covariance: FloatArray  # shape (n, J + 3, J + 3); comes as NaN
     moments: FloatArray  # mean (DN) and variance (DN^2) of each sample, shape (n, J, 2); comes as NaN
-    out: FloatArray  # shape (n, N_OUT), see :mod:`.search_numba`; comes as NaN
-    words: IntArray  # shape (n, N_WORDS); comes as 0
+    found: NDArray[np.void]  # shape (n,), see :data:`.search_numba.RESULT`; comes as 0
 
 
 @kernel
@@ -98,7 +92,7 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
 
 
 @kernel(borrows=True)
-def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float, float]:
+def describe(pixel: Pixel, moments: FloatArray, out: Any) -> tuple[float, float]:
     """Fill moments, frames and extreme codes; return the fewest frames and the most occupied bins."""
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
     for j in range(pixel.facts.shape[0]):
@@ -112,7 +106,7 @@ def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float,
             moments[j, 1] = facts.variance
             first = pixel.centre + int(facts.centre + facts.first)
             lowest, highest = min(lowest, first), max(highest, first + facts.n_bins - 1)
-    words[LOWEST_DN], words[HIGHEST_DN], words[FRAMES] = lowest, highest, int(n)
+    out.lowest_dn, out.highest_dn, out.frames = lowest, highest, int(n)
     return least, occupied
 
 
@@ -244,12 +238,12 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
             fixed[j] = given.dark[j]
         for index in chosen:
             pixel = load_pixel(given, index, room)
-            out, words = answers.out[index], answers.words[index]
-            least, occupied = describe(pixel, answers.moments[index], words)
-            for i in range(out.size):
-                out[i] = math.nan
+            out = answers.found[index]
+            least, occupied = describe(pixel, answers.moments[index], out)
+            out.log_likelihood = out.gap = out.chi2 = out.outlying = out.amplitude = out.weight = math.nan
+            out.freedom = 0
             if least == 0.0 or occupied < 3.0:
-                words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
+                out.status = NO_DATA if least == 0.0 else TOO_FEW_BINS
                 continue
             if limits.cells:
                 resolve(law, index, 0.0, pixel)
@@ -260,18 +254,17 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
             tried = starts.looked[index if starts.looked.size > 1 else 0]
             amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
             task = Task(law, index, amplitudes, near, gap)
-            status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
-            words[EVALUATIONS] += used
+            status = search(pixel, tools, task, best, out)
             if best[n + px.STEP] > 0.0:
                 parameters, covariance = answers.parameters[index], answers.covariance[index]
                 if not plain and n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
-                    if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
+                    if ripple_by_chance(pixel, tools, best, out.log_likelihood):
                         status |= GAIN_AMBIGUOUS
                     if not limits.sandwich:
                         _expect_information(pixel, best, limits, evaluate, scratch)
                 if not _write(pixel, best, limits, scratch, parameters, covariance):
                     status |= FIT_NOT_CONVERGED
-            words[STATUS] = status
+            out.status = status
 
     compiled: Callable[..., None] = fit_tile
     return compiled
