@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE, SMALLEST_MASS
-from pchem_pipeline.model.law.cells_numba import Law, cells_of
+from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.mass_numba import (
     fill_level,
     known_theta,
@@ -21,7 +21,7 @@ from pchem_pipeline.model.law.mass_numba import (
     place_codes,
     share_scratch,
 )
-from pchem_pipeline.model.law.pixel_numba import OWN
+from pchem_pipeline.model.law.pixel_numba import OWN, sample_of
 
 #: Exposure that stands for a prior in which all electron numbers are alike.
 NO_PRIOR = -1.0
@@ -94,7 +94,7 @@ def fill_tables(
         placed, codes = place_codes(p, first[p], n, parts, law, satellites, pixel)
         if not known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
             continue
-        cells = cells_of(placed, 0)
+        cells = sample_of(placed, 0)
         for i in range(n):
             sums[0, i] = sums[1, i] = sums[2, i] = 0.0
             number[at + i] = 0
@@ -111,10 +111,10 @@ def fill_tables(
                 if joint > sums[2, i]:
                     sums[2, i] = joint
                     number[at + i] = min(k, largest)
-        rest = 1.0 - cells.outlier_share
+        rest = 1.0 - cells.law.outlier_share
         for i in range(n):
             if detailed:
-                mass[at + i] = rest * sums[0, i] + cells.outlier_mass
+                mass[at + i] = rest * sums[0, i] + cells.law.outlier_mass
                 right[at + i] = rest * sums[2, i]
             if sums[0, i] > SMALLEST_MASS:
                 if detailed:

@@ -27,10 +27,10 @@ def fill_squared_scores(pixel: Pixel, theta: FloatArray, at: FloatArray) -> None
     slope = np.empty(4)
     slope[1], slope[2], slope[3] = -1.0 / (step * step), 1.0, 0.5 * sigma
     for j in range(n):
-        facts, first, n_bins = pixel.facts[j], pixel.facts[j, px.FIRST], int(pixel.facts[j, px.N_BINS])
+        facts, first, n_bins = pixel.facts[j], pixel.facts[j].first, pixel.facts[j].n_bins
         at[j, px.DAMPING : px.SUMS] = 0.0
-        dark = facts[px.DARK] > 0.0
-        exposure, bias = math.exp(theta[j]), theta[n + px.BIAS] - facts[px.CENTRE]
+        dark = facts.dark
+        exposure, bias = math.exp(theta[j]), theta[n + px.BIAS] - facts.centre
         slope[0] = exposure
         for i in range(n_bins):
             c = pixel.bins[j, px.WEIGHT, i]

@@ -7,9 +7,10 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, IntegerArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntegerArray
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
@@ -339,8 +340,7 @@ class _Batch:
             np.full((n, size), np.nan),
             np.full((n, size, size), np.nan),
             np.full((n, self.n_samples, 2), np.nan),
-            np.full((n, search_numba.N_OUT), np.nan),
-            np.zeros((n, tile_numba.N_WORDS), np.int64),
+            np.zeros(n, search_numba.RESULT),
         )
         packed = pack(laws, n)
         plain = self.n_samples == 1 and not limits.sandwich
@@ -356,7 +356,7 @@ class _Batch:
                 fit_tile(given, some, packed, starts, limits._replace(quick=quick), *tools, answers)
 
         def expect(pixels: IndexArray, gone: FloatArray) -> FloatArray:
-            satellites = answers.out[pixels][:, [search_numba.AMPLITUDE, search_numba.SATELLITE_WEIGHT]]
+            satellites = np.stack([answers.found[name][pixels] for name in ("amplitude", "weight")], axis=1)
             own = laws if cells else None
             return expected_counts(given, pixels, own, answers.parameters[pixels], satellites, gone)
 
@@ -470,15 +470,14 @@ class _Batch:
     ) -> FitResult:
         """Add to the status words what the loop over the pixels does not know, and blank what failed."""
         some = np.arange(self.n) if pixels is None else pixels
-        parameters, covariance, moments, out, words = answers
+        parameters, covariance, moments, out = answers
         n = self.n_samples
-        frames = words[:, tile_numba.FRAMES].astype(np.float64)
-        left = np.nan_to_num(out[:, search_numba.OUTLYING])
-        chi2, dof = out[:, search_numba.CHI2], words[:, tile_numba.FREEDOM].astype(np.float64)
+        frames, left = out["frames"].astype(np.float64), np.nan_to_num(out["outlying"])
+        chi2, dof = out["chi2"].copy(), out["freedom"].astype(np.float64)
         if n == 1 and adjust:
-            dof = self._freedom(some, words, frames, parameters, covariance)
+            dof = self._freedom(out, parameters, covariance)
         probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
-        status = words[:, tile_numba.STATUS].copy()
+        status = out["status"].copy()
         status[probability < self.settings.goodness_limit] |= FitStatus.POOR_FIT
         status[self.outside[some]] |= FitStatus.OUTSIDE_WINDOW
         status[self.truncated[some]] |= FitStatus.BIAS_AMBIGUOUS
@@ -492,7 +491,7 @@ class _Batch:
         failed = (status & int(FAILED)) != 0
         parameters[failed] = np.nan
         covariance[failed] = np.nan
-        weight = np.where(failed, np.nan, np.nan_to_num(out[:, search_numba.SATELLITE_WEIGHT]))
+        weight = np.where(failed, np.nan, np.nan_to_num(out["weight"]))
         return FitResult(
             quanta_exposure=np.ascontiguousarray(parameters[:, :n]),
             conversion_gain=np.ascontiguousarray(parameters[:, n]),
@@ -501,31 +500,24 @@ class _Batch:
             covariance=covariance,
             mean=np.ascontiguousarray(moments[:, :, 0]),
             variance=np.ascontiguousarray(moments[:, :, 1]),
-            log_likelihood=out[:, search_numba.LOG_LIKELIHOOD].copy(),
-            likelihood_gap=out[:, search_numba.GAP].copy(),
+            log_likelihood=out["log_likelihood"].copy(),
+            likelihood_gap=out["gap"].copy(),
             fit_status=status.astype(np.uint16),
-            n_iterations=words[:, tile_numba.EVALUATIONS].astype(np.int32),
-            goodness_chi2=chi2.copy(),
+            n_iterations=out["evaluations"].astype(np.int32),
+            goodness_chi2=chi2,
             goodness_dof=dof,
             goodness_p=probability,
             outlier_share=left / np.maximum(frames + left, 1.0),
-            satellite_amplitude_e=np.where(weight > 0, out[:, search_numba.AMPLITUDE], np.nan),
+            satellite_amplitude_e=np.where(weight > 0, out["amplitude"], np.nan),
             satellite_weight=weight,
         )
 
-    def _freedom(
-        self,
-        pixels: IndexArray,
-        words: IntArray,
-        frames: FloatArray,
-        parameters: FloatArray,
-        covariance: FloatArray,
-    ) -> FloatArray:
+    def _freedom(self, out: NDArray[np.void], parameters: FloatArray, covariance: FloatArray) -> FloatArray:
         """Return the degrees of freedom of chi-square, those that merged bins leave to it included.
 
         It loses as many of the four parameters as its groups determine (Chernoff and Lehmann 1954).
         """
-        freedom = words[:, tile_numba.FREEDOM].astype(np.float64)
+        freedom, frames = out["freedom"].astype(np.float64), out["frames"].astype(np.float64)
         few = np.flatnonzero((freedom > 0) & (freedom < _FEW_GROUPS) & (frames < _FEW_FRAMES))
         if few.size:
             own = covariance[few]
@@ -533,7 +525,7 @@ class _Batch:
                 _, information = expected_scores(list(parameters[few].T))
                 own = inverse_information(frames[few, None, None] * information)
             known = np.empty(few.size)
-            ends = (words[few, tile_numba.LOWEST_DN], words[few, tile_numba.HIGHEST_DN])
+            ends = out["lowest_dn"][few], out["highest_dn"][few]
             information_numba.grouped_trace(*ends, frames[few], parameters[few], own, known)
             freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
         return freedom

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -15,14 +16,9 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
-    AMPLITUDE,
     CLEAR_GAP,
-    DEGREES,
     FIT_NOT_CONVERGED,
-    GAP,
-    LOG_LIKELIHOOD,
     NEAR_TWO,
-    SATELLITE_WEIGHT,
     SURELY_SEEN,
     SUSPICIOUS,
     Found,
@@ -80,20 +76,20 @@ def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray)
     )
     left = frames = 0.0
     for j in range(n):
-        facts, k = pixel.facts[j], math.exp(near[j])
-        if facts[px.DARK] > 0.0:
+        facts, law, k = pixel.facts[j], pixel.laws[j], math.exp(near[j])
+        if facts.dark:
             k = 0.0
         elif not warm:
             exposure = k
             for i in range(pixel.mixtures.shape[2]):
                 exposure -= pixel.mixtures[j, px.ADDED_WEIGHT, i] * pixel.mixtures[j, px.ADDED_EXPOSURE, i]
             theta[j] = math.log(max(exposure, _LEAST_SHARE * k))
-        spread = facts[px.EXTRA_E2] + k * (facts[px.PER_ELECTRON] + k * facts[px.PER_ELECTRON2])
+        spread = law.extra_e2 + k * (law.per_electron + k * law.per_electron2)
         own = 0.0
-        for i in range(int(facts[px.N_PEAKS])):
+        for i in range(facts.n_peaks):
             own += pixel.peaks[j, px.SHARE, i] * pixel.peaks[j, px.WIDTH, i] ** 2
-        left += facts[px.N_FRAMES] * (analog2 - a * a * spread - facts[px.EXTRA_DN2]) / own
-        frames += facts[px.N_FRAMES]
+        left += facts.n_frames * (analog2 - a * a * spread - law.extra_dn2) / own
+        frames += facts.n_frames
     if not warm:
         analog2 = max(left / frames, _LEAST_SHARE * analog2)
     theta[n + px.LOG_VARIANCE] = math.log(analog2)
@@ -106,10 +102,10 @@ def _share_at_limits(pixel: Pixel) -> float:
     largest = 0.0
     for j in range(pixel.facts.shape[0]):
         facts, found = pixel.facts[j], 0.0
-        for i in range(int(facts[px.N_BINS])):
-            if i <= facts[px.BOTTOM] or i + 1 >= facts[px.TOP]:
+        for i in range(facts.n_bins):
+            if i <= facts.bottom or i + 1 >= facts.top:
                 found += pixel.bins[j, px.WEIGHT, i]
-        largest = max(largest, found / facts[px.N_FRAMES])
+        largest = max(largest, found / facts.n_frames)
     return largest
 
 
@@ -123,22 +119,22 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> None:
     trial, place = tools.scratch.small[px.HERE], 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, px.CUMULATIVE]
     no_starts(tools.scratch.small[px.HEIGHTS])
-    while cumulative[place + 1] < 0.5 * facts[px.N_FRAMES]:
+    while cumulative[place + 1] < 0.5 * facts.n_frames:
         place += 1
-    a, least = facts[px.N_BINS] + 1.0, max(0.25 * math.sqrt(facts[px.VARIANCE]), LEAST_STEP)
+    a, least = facts.n_bins + 1.0, max(0.25 * math.sqrt(facts.variance), LEAST_STEP)
     while a > least:
         for exposure in _CUT_EXPOSURES:
             middle = max(exposure - 0.3, 0.0)  # e-: the median of the electrons, to a third
             for around in range(-_AROUND, _AROUND + 1):
                 trial[0], trial[1 + px.STEP], trial[1 + px.SATELLITE] = math.log(exposure), a, 0.0
-                trial[1 + px.BIAS] = facts[px.FIRST] + place - a * (middle + around / _STEPS)
+                trial[1 + px.BIAS] = facts.first + place - a * (middle + around / _STEPS)
                 trial[1 + px.LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
                 keep_start(pixel, tools.evaluate, True, tools.scratch)
         a /= _CUT_RATIO
 
 
 @kernel(borrows=True)
-def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, found: Found) -> Found:
+def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: Any, found: Found) -> Found:
     """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
@@ -182,7 +178,7 @@ def _start_anew(
     score: float,
     gap: float,
     best: FloatArray,
-    out: FloatArray,
+    out: Any,
     found: Found,
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
@@ -216,7 +212,7 @@ def _start_anew(
 
 @kernel
 def _try_satellites(
-    pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: FloatArray, found: Found
+    pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: Any, found: Found
 ) -> Found:
     """Try free satellites of each amplitude; ``out`` is that of the fit with those that are kept."""
     n = pixel.facts.shape[0]
@@ -227,17 +223,15 @@ def _try_satellites(
     )
     loglik = examine(pixel, tools, best, out)
     if amplitude > 0.0:
-        out[DEGREES] = max(out[DEGREES] - 2.0, 0.0)
-    out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + px.SATELLITE]
+        out.freedom = max(out.freedom - 2, 0)
+    out.amplitude, out.weight = amplitude, best[n + px.SATELLITE]
     return Found(loglik, found.runner_up, found.degenerate)
 
 
-def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
+def search_with(satellites: bool) -> Callable[..., int]:
     """Make the search; ``satellites``: with what tries free ones."""
 
-    def search_cells(
-        pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
-    ) -> tuple[int, int, int]:
+    def search_cells(pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: Any) -> int:
         """Find the most likely parameters of one pixel with its cells integrated, under any law.
 
         From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
@@ -250,7 +244,7 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         gap, score = task.gap if known else math.inf, math.inf
         best[n + px.STEP] = 0.0
         tools.scratch.flags[px.FIXED, n + px.SATELLITE] = True
-        out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
+        out.amplitude = out.weight = 0.0
         found = Found(-math.inf, -math.inf, np.bool_(False))
         at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
         cut = n == 1 and at_limits
@@ -267,7 +261,9 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
             found = Found(loglik, runner_up, found.degenerate)
         found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
         if not best[n + px.STEP] > 0.0:
-            return FIT_NOT_CONVERGED, tools.scratch.used[0], 0
+            out.freedom = 0
+            out.evaluations += tools.scratch.used[0]
+            return FIT_NOT_CONVERGED
         bias_gap = min(gap, found.loglik - found.runner_up)
         blurred = math.inf
         if n == 1 and not (limits.warm or limits.reshapes):
@@ -275,7 +271,8 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
         gap = min(bias_gap, found.loglik - null, blurred)
         if satellites and task.amplitudes.size > 0:
             found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
-        out[LOG_LIKELIHOOD], out[GAP], used = found.loglik, gap, tools.scratch.used[0]
+        out.log_likelihood, out.gap = found.loglik, gap
+        out.evaluations += tools.scratch.used[0]
         # the density has told whether there is a gain: it knows no other law than one Gaussian does
         above_null = math.inf if known else found.loglik - null
         of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
@@ -286,6 +283,6 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
             unsure = bias_gap < limits.gap
         of_gain = of_gain or (at_limits and unsure)
         word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
-        return word, used, int(out[DEGREES])
+        return int(word)
 
     return search_cells

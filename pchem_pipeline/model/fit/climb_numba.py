@@ -170,7 +170,7 @@ def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out
     n = sum_k = sum_kk = sum_ke = sum_e = sum_ee = 0.0
     for j in range(samples):
         sums = at[j, px.SUMS]
-        n += pixel.facts[j, px.N_FRAMES]
+        n += pixel.facts[j].n_frames
         sum_k, sum_kk, sum_ke = sum_k + sums[px.SUM_K], sum_kk + sums[px.SUM_KK], sum_ke + sums[px.SUM_KE]
         sum_e, sum_ee = sum_e + sums[px.SUM_E], sum_ee + sums[px.SUM_EE]
     exposure = sum_k / n
@@ -186,7 +186,7 @@ def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out
         return False
     copy(theta, out)
     for j in range(samples):
-        own = at[j, px.SUMS, px.SUM_K] / pixel.facts[j, px.N_FRAMES]
+        own = at[j, px.SUMS, px.SUM_K] / pixel.facts[j].n_frames
         out[j] = max(limits.bound, math.log(own)) if own > 0.0 else limits.bound
     out[samples + px.STEP] = a
     out[samples + px.BIAS] = theta[samples + px.BIAS] + mean_e - change * exposure

@@ -14,12 +14,12 @@ from pchem_pipeline.model.fit import cells_search_numba, climb_numba, search_num
 from pchem_pipeline.model.fit.climb_numba import Goal, Limits
 from pchem_pipeline.model.law import cells_numba, density_numba
 from pchem_pipeline.model.law.inputs import pack
-from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
+from pchem_pipeline.model.law.pixel_numba import FACTS, LAW, Pixel, Scratch
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _VECTOR = np.zeros(1)
 _OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64))
-_FOUND = numba.types.UniTuple(numba.types.int64, 3)
+_RESULT = numba.from_dtype(search_numba.RESULT)
 _LIMITS = Limits(0.0, 0.0, 0, 0, False, False, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, False, False, False)
 
 
@@ -32,7 +32,7 @@ def _address(result: Any, arguments: tuple[Any, ...]) -> Any:
 def _evaluation_arguments() -> tuple[Any, ...]:
     """Return an example of each argument of a likelihood."""
     rows, stack = np.zeros((1, 1)), np.zeros((1, 1, 1))
-    pixel = Pixel(stack, rows, stack, stack, 0, 0.0)
+    pixel = Pixel(stack, np.zeros(1, FACTS), np.zeros(1, LAW), stack, stack, 0, 0.0)
     flags, evaluations, used = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1)), np.zeros(1, np.int64)
     scratch = Scratch(rows, rows, rows, rows, stack, rows, rows, flags, evaluations, used)
     return pixel, _VECTOR, 0, scratch, stack
@@ -54,7 +54,7 @@ def _search_arguments() -> tuple[Any, ...]:
         types_of((_LIMITS, evaluate, climb_on, np.zeros((1, 1)), scratch)), search_numba.Tools
     )
     task = search_numba.Task(pack([SampleLaw()], 1), 0, _VECTOR, _VECTOR, 0.0)
-    return pixel, tools, task, _VECTOR, _VECTOR
+    return pixel, tools, task, _VECTOR, _RESULT
 
 
 @functools.cache
@@ -76,13 +76,13 @@ def likelihood(cells: bool) -> Any:
 @functools.cache
 def density_search() -> Any:
     """Return the search with the density, :func:`.search_numba.search_density`."""
-    return callback(search_numba.search_density, _FOUND, _search_arguments(), borrows=True)
+    return callback(search_numba.search_density, numba.types.int64, _search_arguments(), borrows=True)
 
 
 @functools.cache
 def cells_search(satellites: bool) -> Any:
     """Return the search with the cells, and of free satellites: :func:`.cells_search_numba.search_with`."""
-    return callback(cells_search_numba.search_with(satellites), _FOUND, _search_arguments())
+    return callback(cells_search_numba.search_with(satellites), numba.types.int64, _search_arguments())
 
 
 @functools.cache

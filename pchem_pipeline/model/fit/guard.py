@@ -18,8 +18,8 @@ from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.arithmetic.statistics import chi_square
 from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
-from pchem_pipeline.model.fit.search_numba import CHI2, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, OUTLYING
-from pchem_pipeline.model.fit.tile_numba import EVALUATIONS, FREEDOM, STATUS, Answers, Histograms
+from pchem_pipeline.model.fit.search_numba import FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED
+from pchem_pipeline.model.fit.tile_numba import Answers, Histograms
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
@@ -125,13 +125,13 @@ def fit_guarded(
             it left out.
         given: histograms; codes that are left out before stay so at first; out: those left out at last.
         limits: bounds and limits.
-        answers: what the fit fills; out: ``OUTLYING``, the samples left out.
+        answers: what the fit fills; out: ``outlying``, the samples left out.
     """
     n = given.counts.shape[0]
     everything = np.arange(n)
     if limits.floor == 0.0:
         fit(everything, False)
-        answers.out[:, OUTLYING] = 0.0
+        answers.found["outlying"] = 0.0
         return
     counters = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.full(n, -1)
     ends, far = far_samples(given)
@@ -144,7 +144,7 @@ def fit_guarded(
     suspicious = ~far & ~resumed & guard.suspicious(everything)
     guard.whole = Answers._make(each[suspicious] for each in answers)
     guard.place[suspicious] = np.arange(np.count_nonzero(suspicious))
-    answers.out[~far & ~suspicious & ~resumed, OUTLYING] = 0.0
+    answers.found["outlying"][~far & ~suspicious & ~resumed] = 0.0
     guard.attempt[:] = np.where(resumed | far | ~good, _EXPECTED, _EXPECTED - 1)
     again, stuck = guard.check(np.flatnonzero(resumed), far)
     stuck = np.concatenate([stuck, np.flatnonzero(far & ~resumed | suspicious)])
@@ -173,10 +173,10 @@ class _Guard:
     def fit_again(self, pixels: IndexArray) -> None:
         """Fit what the mask leaves of pixels, all of whose samples are not fitted twice."""
         known = (self.place[pixels] >= 0) & (self.gone[pixels] == 0)
-        spent = self.answers.words[pixels[known], EVALUATIONS]
+        spent = self.answers.found["evaluations"][pixels[known]]
         for each, of_all in zip(self.answers, self.whole, strict=True):
             each[pixels[known]] = of_all[self.place[pixels[known]]]
-        self.answers.words[pixels[known], EVALUATIONS] = spent
+        self.answers.found["evaluations"][pixels[known]] = spent
         pixels = pixels[~known]
         quick = self._cut(pixels)
         for some, quickly in ((pixels[quick], True), (pixels[~quick], False)):
@@ -190,11 +190,11 @@ class _Guard:
 
     def suspicious(self, pixels: IndexArray) -> BoolArray:
         """Return which fits may have been led by outliers: by single samples or as a whole."""
-        out = self.answers.out[pixels]
-        fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
+        outlying = self.answers.found["outlying"][pixels]
+        fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(outlying)
         # of such a goodness of fit outliers may be to blame
         misfit = (_scores(self.answers)[pixels] > BEYOND_DOUBT) & (not self.limits.cells)
-        return np.asarray(fitted & ((out[:, OUTLYING] > 0) | misfit))
+        return np.asarray(fitted & ((outlying > 0) | misfit))
 
     def begin(self, pixels: IndexArray, far: BoolArray) -> IndexArray:
         """Leave out what the next attempt says, or the first that leaves out few enough; return pixels."""
@@ -245,15 +245,15 @@ class _Guard:
         answers, last = self.answers, self.attempt[pixels] == _N_ATTEMPTS
         lost = pixels[last & far[pixels] & self.suspicious(pixels)]
         # only far samples speak for a gain, and it does not explain them
-        answers.words[lost, STATUS] |= GAIN_NOT_IDENTIFIED
-        answers.out[pixels[last], OUTLYING] = 0.0
+        answers.found["status"][lost] |= GAIN_NOT_IDENTIFIED
+        answers.found["outlying"][pixels[last]] = 0.0
         pixels = pixels[~last]
-        failed = (answers.words[pixels, STATUS] & (FIT_NOT_CONVERGED | GAIN_NOT_IDENTIFIED)) != 0
-        failed |= ~np.isfinite(answers.out[pixels, OUTLYING])
+        failed = (answers.found["status"][pixels] & (FIT_NOT_CONVERGED | GAIN_NOT_IDENTIFIED)) != 0
+        failed |= ~np.isfinite(answers.found["outlying"][pixels])
         stuck, pixels = pixels[failed], pixels[~failed]
         before = self.gone[pixels]
         changed = self._leave_out_unexpected(pixels) | self._cut(pixels)
-        answers.out[pixels[~changed], OUTLYING] = before[~changed]
+        answers.found["outlying"][pixels[~changed]] = before[~changed]
         pixels = pixels[changed]
         self.passes[pixels] += 1
         more = (self.passes[pixels] < _MOST_PASSES) & self._few(pixels)
@@ -266,5 +266,5 @@ class _Guard:
 
 def _scores(answers: Answers) -> FloatArray:
     """Return the goodness of fit of all pixels as standard normal deviates; 0 without freedom."""
-    freedom = answers.words[:, FREEDOM]
-    return np.where(freedom > 0, chi_square(answers.out[:, CHI2], np.maximum(freedom, 1)), 0.0)
+    freedom = answers.found["freedom"]
+    return np.where(freedom > 0, chi_square(answers.found["chi2"], np.maximum(freedom, 1)), 0.0)

@@ -60,7 +60,9 @@ def climb_tile(
     for row in range(chosen.size):
         pixel = load_pixel(given, chosen[row], room)
         if fixed[row, n + px.STEP] and fixed[row, n + px.LOG_VARIANCE]:
-            pixel = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.centre, px.KNOWN)
+            pixel = Pixel(
+                pixel.bins, pixel.facts, pixel.laws, pixel.peaks, pixel.mixtures, pixel.centre, px.KNOWN
+            )
         if limits.cells:
             resolve(law, chosen[row], amplitudes[row], pixel)
         copy(theta[row], here)

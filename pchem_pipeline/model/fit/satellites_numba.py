@@ -27,7 +27,7 @@ from pchem_pipeline.model.fit.search_numba import (
 from pchem_pipeline.model.fit.starts_numba import keep_start, no_starts
 from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.cells_numba import Law, set_peaks
-from pchem_pipeline.model.law.pixel_numba import Histogram, Pixel, Scratch, copy, histogram_of
+from pchem_pipeline.model.law.pixel_numba import Pixel, Sample, Scratch, copy, sample_of
 
 _SCREEN = 0.2  # of the rise asked of free satellites, seen from the fit without them
 #: steps of the other starts in units of that of a Poisson law without noise, third cumulant over variance
@@ -55,7 +55,7 @@ def _evaluate_weight(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratc
     rise, weight, place = 0.0, theta[theta.size - 1], 1 + px.SATELLITE
     for j in range(pixel.facts.shape[0]):
         weights, room, slope, bend = pixel.bins[j, px.WEIGHT], scratch.cells[j], 0.0, 0.0
-        for i in range(int(pixel.facts[j, px.N_BINS])):
+        for i in range(pixel.facts[j].n_bins):
             if weights[i] > 0.0 and room[px.MASS, i] > 0.0:
                 ratio = room[px.SLOPES + place, i] / room[px.MASS, i]
                 factor = 1.0 + weight * ratio
@@ -86,7 +86,7 @@ def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, 
         fixed[i] = True
     _, rise, _, _ = ascend(pixel, _evaluate_weight, limits, from_start(), theta, theta, scratch)
     for i in range(last):
-        fixed[i] = i < pixel.facts.shape[0] and pixel.facts[i, px.DARK] > 0.0
+        fixed[i] = i < pixel.facts.shape[0] and pixel.facts[i].dark
     theta[last] = min(max(theta[last], _LEAST_START), _MOST_START)
     return without, rise, expected
 
@@ -105,7 +105,7 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
     n = pixel.facts.shape[0]
     for j in range(n):
         exposure = math.exp(theta[j]) + direction
-        if pixel.facts[j, px.DARK] == 0.0:
+        if not pixel.facts[j].dark:
             if not exposure > 0.03:
                 return -math.inf
             theta[j] = math.log(exposure)
@@ -116,7 +116,7 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
 
 @kernel(borrows=True)
 def _with_cumulants(
-    a: float, third: float, histogram: Histogram, moments: tuple[float, float, float], theta: FloatArray
+    a: float, third: float, histogram: Sample, moments: tuple[float, float, float], theta: FloatArray
 ) -> bool:
     """Fill ``theta`` of a single sample from the cumulants of its histogram, given the step, DN.
 
@@ -128,13 +128,13 @@ def _with_cumulants(
     for _ in range(4 if m1 != 0.0 or m3 != 0.0 else 1):
         own = weight * (m3 - weight * m1 * (3.0 * m2 - 2.0 * weight * m1 * m1))
         exposure = third / a**3 - own
-        spread = histogram.variance / (a * a) - exposure - _NOISE_E * _NOISE_E
+        spread = histogram.facts.variance / (a * a) - exposure - _NOISE_E * _NOISE_E
         weight = min(max(spread / (m2 - weight * m1 * m1), _LEAST_WEIGHT), _MOST_WEIGHT)
     if not exposure > 0.03 or spread < -_SHORTFALL * exposure:
         return False
     theta[0] = math.log(exposure)
     theta[1 + px.STEP] = a
-    theta[1 + px.BIAS] = histogram.mean - a * (exposure + weight * m1)
+    theta[1 + px.BIAS] = histogram.facts.mean - a * (exposure + weight * m1)
     theta[1 + px.LOG_VARIANCE] = 2.0 * math.log(_NOISE_E * a)
     theta[1 + px.SATELLITE] = weight
     fine: bool = sensible(theta, math.inf, True)
@@ -144,12 +144,15 @@ def _with_cumulants(
 @kernel(borrows=True)
 def _from_cumulants(pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray) -> bool:
     """Fill ``theta`` with the likeliest comb of a histogram's cumulants; return whether there is one."""
-    scratch, histogram = tools.scratch, histogram_of(pixel, 0)
+    scratch, histogram = tools.scratch, sample_of(pixel, 0)
     third = m1 = m2 = m3 = 0.0
-    for i in range(histogram.n_bins):
-        third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
+    for i in range(histogram.facts.n_bins):
+        third += histogram.bins[px.WEIGHT][i] * (histogram.facts.first + i - histogram.facts.mean) ** 3
     # the third cumulant, DN^3, but at least that of a small skewness
-    third = max(third / histogram.n, _LEAST_SKEWNESS * histogram.variance * math.sqrt(histogram.variance))
+    third = max(
+        third / histogram.facts.n_frames,
+        _LEAST_SKEWNESS * histogram.facts.variance * math.sqrt(histogram.facts.variance),
+    )
     for side in range(law.pattern.shape[0]):
         shift = law.pattern[side, 0] * amplitude
         m1 += law.pattern[side, 1] * shift
@@ -159,7 +162,7 @@ def _from_cumulants(pixel: Pixel, law: Law, amplitude: float, tools: Tools, thet
         m1 = m3 = 0.0
     no_starts(scratch.small[px.HEIGHTS])
     for scale in _SCALES:
-        a = scale * third / histogram.variance
+        a = scale * third / histogram.facts.variance
         if _with_cumulants(a, third, histogram, (m1, m2, m3), scratch.small[px.HERE]):
             keep_start(pixel, tools.evaluate, True, scratch)
     return bool(next_start(scratch, theta))

@@ -27,9 +27,24 @@ EXPOSURE_AT_BOUND, BIAS_AMBIGUOUS = int(FitStatus.EXPOSURE_AT_BOUND), int(FitSta
 NOT_INFORMATIVE, COARSE_STEPS = int(FitStatus.NOT_INFORMATIVE), int(FitStatus.COARSE_STEPS)
 GAIN_AMBIGUOUS = int(FitStatus.GAIN_AMBIGUOUS)
 
-# columns of a row of results
-LOG_LIKELIHOOD, GAP, CHI2, DEGREES, OUTLYING, AMPLITUDE, SATELLITE_WEIGHT = range(7)
-N_OUT = 7
+#: What a search, and the loop over the pixels, finds of one beside its parameters.
+RESULT = np.dtype(
+    [
+        ("status", "i8"),
+        ("evaluations", "i8"),
+        ("lowest_dn", "i8"),
+        ("highest_dn", "i8"),
+        ("frames", "i8"),
+        ("log_likelihood", "f8"),
+        ("gap", "f8"),  # nats to the runner-up
+        ("chi2", "f8"),
+        ("freedom", "i8"),
+        ("outlying", "f8"),  # samples where none are expected
+        ("amplitude", "f8"),  # of free satellites, e-
+        ("weight", "f8"),
+    ],
+    align=True,
+)
 
 CLEAR_GAP = 30.0  # nats: a neighbour this far below is not climbed to the end
 SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
@@ -111,8 +126,8 @@ def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
     """Return the nats that peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring: ``N r^2``."""
     n, frames = pixel.facts.shape[0], 0.0
     for j in range(n):
-        if pixel.facts[j, px.DARK] == 0.0:
-            frames += pixel.facts[j, px.N_FRAMES]
+        if not pixel.facts[j].dark:
+            frames += pixel.facts[j].n_frames
     noise2 = math.exp(best[n + px.LOG_VARIANCE]) / best[n + px.STEP] ** 2
     return frames * math.exp(-4.0 * math.pi**2 * noise2)
 
@@ -122,7 +137,7 @@ def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
     """Return the largest exposure of a pixel's samples, e-."""
     most = 0.0
     for j in range(pixel.facts.shape[0]):
-        if pixel.facts[j, px.DARK] == 0.0:
+        if not pixel.facts[j].dark:
             most = max(most, math.exp(theta[j]))
     return most
 
@@ -136,9 +151,9 @@ def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     n = pixel.facts.shape[0]
     if n == 1:
         return 4 if cells and not theta[n + px.STEP] > FEW_STEP else 2
-    frames = pixel.facts[0, px.N_FRAMES]
+    frames = pixel.facts[0].n_frames
     for j in range(n):
-        frames = min(frames, pixel.facts[j, px.N_FRAMES])
+        frames = min(frames, pixel.facts[j].n_frames)
     reach = 3.0 * math.sqrt(2.0 / frames) * _most_electrons(pixel, theta)
     return 4 + 2 * int(min(reach, _MOST_STEPS))
 
@@ -205,8 +220,8 @@ def loglik_without_gain(pixel: Pixel) -> float:
     """Return the log-likelihood of Gaussians of one width, each at the mean of its sample: g to infinity."""
     n = square = 0.0
     for j in range(pixel.facts.shape[0]):
-        n += pixel.facts[j, px.N_FRAMES]
-        square += pixel.facts[j, px.N_FRAMES] * pixel.facts[j, px.VARIANCE]
+        n += pixel.facts[j].n_frames
+        square += pixel.facts[j].n_frames * pixel.facts[j].variance
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(square / n, QUANTISATION_VARIANCE)))
 
 
@@ -220,9 +235,9 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
     """
     facts, weights, trial = pixel.facts[0], pixel.bins[0, px.WEIGHT], scratch.small[px.HERE]
     third = 0.0
-    for i in range(int(facts[px.N_BINS])):
-        third += weights[i] * (facts[px.FIRST] + i - facts[px.MEAN]) ** 3
-    skewness = max(third / facts[px.N_FRAMES] / facts[px.VARIANCE] ** 1.5, _LEAST_SKEWNESS)
+    for i in range(facts.n_bins):
+        third += weights[i] * (facts.first + i - facts.mean) ** 3
+    skewness = max(third / facts.n_frames / facts.variance**1.5, _LEAST_SKEWNESS)
     low, high = 2.0 * _BLURRED2, 4.0 / skewness**2 + 10.0
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
@@ -230,9 +245,9 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
             low = middle
         else:
             high = middle
-    a = math.sqrt(facts[px.VARIANCE] / (low + _BLURRED2))
+    a = math.sqrt(facts.variance / (low + _BLURRED2))
     rounding = QUANTISATION_VARIANCE if cells else 0.0
-    trial[0], trial[1 + px.STEP], trial[1 + px.BIAS] = math.log(low), a, facts[px.MEAN] - low * a
+    trial[0], trial[1 + px.STEP], trial[1 + px.BIAS] = math.log(low), a, facts.mean - low * a
     trial[1 + px.LOG_VARIANCE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01))
     trial[1 + px.SATELLITE] = 0.0
     loglik: float = evaluate(pixel, trial, px.LOGLIK_ALONE, scratch, scratch.evaluations[px.AT])
@@ -248,16 +263,14 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     n = pixel.facts.shape[0]
     most = 0.0
     for j in range(n):
-        if pixel.facts[j, px.DARK] == 0.0:
-            most = max(most, pixel.facts[j, px.N_FRAMES])
+        if not pixel.facts[j].dark:
+            most = max(most, pixel.facts[j].n_frames)
     noise2 = math.exp(theta[n + px.LOG_VARIANCE]) / theta[n + px.STEP] ** 2
     return math.sqrt(most) * math.exp(-2.0 * math.pi**2 * noise2)
 
 
 @kernel(borrows=True)
-def settled(
-    pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: FloatArray
-) -> tuple[bool, bool]:
+def settled(pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: Any) -> tuple[bool, bool]:
     """Return whether a maximum fits well, its gain settled, and whether others may be higher.
 
     They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all
@@ -267,8 +280,8 @@ def settled(
     n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
     good = score_of(out) < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
     good = good and (n > 1 or above_null > CLEAR_GAP)
-    misfit = math.sqrt(out[CHI2] / max(out[DEGREES], 1.0))
-    of_the_model = n == 1 and out[DEGREES] > 0.0 and lobe > _SURE_LOBE * misfit
+    misfit = math.sqrt(out.chi2 / max(out.freedom, 1))
+    of_the_model = n == 1 and out.freedom > 0 and lobe > _SURE_LOBE * misfit
     return good, not (good or of_the_model)
 
 
@@ -335,11 +348,11 @@ def goodness(pixel: Pixel) -> tuple[float, int]:
     chi2, freedom = 0.0, 1 - FITTED_PARAMETERS
     for j in range(pixel.facts.shape[0]):
         bins, facts = pixel.bins[j], pixel.facts[j]
-        own, degrees = pearson(bins[px.WEIGHT], bins[px.EXPECTED], int(facts[px.N_BINS]), facts[px.N_FRAMES])
+        own, degrees = pearson(bins[px.WEIGHT], bins[px.EXPECTED], facts.n_bins, facts.n_frames)
         if degrees > 0:
             chi2 += own
             freedom += degrees + FITTED_PARAMETERS
-            if facts[px.DARK] == 0.0:
+            if not facts.dark:
                 freedom -= 1
     if freedom <= 0:
         return math.nan, 0
@@ -352,28 +365,27 @@ def outlying(pixel: Pixel, floor: float) -> float:
     found = 0.0
     for j in range(pixel.facts.shape[0]):
         bins = pixel.bins[j]
-        for i in range(int(pixel.facts[j, px.N_BINS])):
+        for i in range(pixel.facts[j].n_bins):
             if bins[px.EXPECTED, i] < floor:
                 found += bins[px.WEIGHT, i]
     return found
 
 
 @kernel(borrows=True)
-def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> float:
+def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: Any) -> float:
     """Evaluate at a maximum, into `AT_BEST`; fill goodness of fit and outliers; return the log-likelihood."""
     scratch = tools.scratch
     loglik: float = tools.evaluate(pixel, theta, px.EXPECTATIONS, scratch, scratch.evaluations[px.AT_BEST])
     scratch.used[0] += 1
-    out[OUTLYING] = outlying(pixel, tools.limits.floor)
-    out[CHI2], freedom = goodness(pixel)
-    out[DEGREES] = float(freedom)
+    out.outlying = outlying(pixel, tools.limits.floor)
+    out.chi2, out.freedom = goodness(pixel)
     return loglik
 
 
 @kernel(borrows=True)
-def score_of(out: FloatArray) -> float:
+def score_of(out: Any) -> float:
     """Return the goodness of fit in a row of results as a standard normal deviate."""
-    score: float = normal_score(out[CHI2], int(out[DEGREES]))
+    score: float = normal_score(out.chi2, out.freedom)
     return score
 
 
@@ -397,7 +409,7 @@ def judge(
     sigma, a = math.exp(0.5 * best[n + px.LOG_VARIANCE]), best[n + px.STEP]
     at_bound = True
     for j in range(n):
-        at_bound = at_bound and (pixel.facts[j, px.DARK] > 0.0 or best[j] <= limits.bound + 1e-9)
+        at_bound = at_bound and (pixel.facts[j].dark or best[j] <= limits.bound + 1e-9)
     if above_null < limits.gap:
         status |= GAIN_NOT_IDENTIFIED
     if gap < limits.gap:
@@ -413,7 +425,7 @@ def judge(
     if n > 1 and limits.cells and sigma < _COARSE_NOISE and 1.0 / a > 0.5 - NEAR_TWO:
         status |= GAIN_AMBIGUOUS  # combs with the same codes are looked for in single samples only
     if n == 1:
-        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, px.OCCUPIED] < _FEWEST_CODES):
+        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0].occupied < _FEWEST_CODES):
             status |= GAIN_AMBIGUOUS
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)
@@ -520,15 +532,15 @@ def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -
 
 
 @kernel(borrows=True)
-def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray) -> Found:
+def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: Any) -> Found:
     """Examine a new best maximum and, unless the fit rules them out, its neighbours; keep the likeliest."""
     n, loglik, runner_up = pixel.facts.shape[0], found.loglik, found.runner_up
     at_best = examine(pixel, tools, best, out)
     if n == 1 and not tools.limits.cells:
         good, _ = settled(pixel, best, clear, math.inf, out)
-        expected = expected_gap(pixel.facts[0, px.N_FRAMES], best)
+        expected = expected_gap(pixel.facts[0].n_frames, best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
-        if good and out[DEGREES] > 0.0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
+        if good and out.freedom > 0 and expected > sure and best[n + px.STEP] > _FINE_STEP:
             return Found(at_best, max(runner_up, at_best - expected), found.degenerate)
     higher, beside = climb_neighbours(pixel, tools, best, loglik)
     if higher > loglik:
@@ -538,13 +550,7 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
 
 @kernel(borrows=True)
 def _climb_start(
-    pixel: Pixel,
-    tools: Tools,
-    clear: bool,
-    found: Found,
-    trial: FloatArray,
-    best: FloatArray,
-    out: FloatArray,
+    pixel: Pixel, tools: Tools, clear: bool, found: Found, trial: FloatArray, best: FloatArray, out: Any
 ) -> Found:
     """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
@@ -571,9 +577,7 @@ def _climb_start(
 
 
 @kernel(borrows=True)
-def climb_starts(
-    pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
-) -> Found:
+def climb_starts(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: Any) -> Found:
     """Climb from the starts, the highest first; a higher maximum takes the place of ``best``."""
     trial = tools.scratch.small[px.HERE]
     while next_start(tools.scratch, trial):
@@ -582,9 +586,7 @@ def climb_starts(
 
 
 @kernel(borrows=True)
-def _stay_near(
-    pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
-) -> tuple[bool, float]:
+def _stay_near(pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: Any) -> tuple[bool, float]:
     """Climb from what is known; return whether that fits well, and its log-likelihood."""
     copy(task.near, trial)
     outcome, loglik = climb_on(pixel, tools, from_start(), trial, trial)
@@ -594,36 +596,27 @@ def _stay_near(
     return score_of(out) < SUSPICIOUS, loglik
 
 
-def search_density(
-    pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
-) -> tuple[int, int, int]:
+def search_density(pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: Any) -> int:
     """Find the most likely parameters of one pixel with the density.
 
     Where an answer is known to be near, the maximum next to it is taken as long as it fits well. Otherwise
     the first start is climbed from; where the goodness of fit or a side lobe in the noise raises suspicion,
     the other starts follow; the likeliest maximum is kept.
 
-    ``best`` becomes theta at the maximum, its step 0 where there is none, ``out`` a row of results, see
-    `LOG_LIKELIHOOD`; score and information at the maximum are in `AT_BEST`.
-
-    Returns:
-        Status word, evaluations, degrees of freedom of the goodness of fit.
+    ``best`` becomes theta at the maximum, its step 0 where there is none, ``out`` is filled, see `RESULT`;
+    score and information at the maximum are in `AT_BEST`. Return the status word.
     """
-    n, trial, limits, used = (
-        pixel.facts.shape[0],
-        tools.scratch.small[px.HERE],
-        tools.limits,
-        tools.scratch.used,
-    )
-    heights, null = tools.scratch.small[px.HEIGHTS], loglik_without_gain(pixel)
+    n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
+    used, trial, heights = tools.scratch.used, tools.scratch.small[px.HERE], tools.scratch.small[px.HEIGHTS]
     best[n + px.STEP] = 0.0
     if task.near[n + px.STEP] > 0.0:
         fits, loglik = _stay_near(pixel, tools, task, trial, out)
         if fits:
             copy(trial, best)
-            out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
+            out.log_likelihood, out.gap = loglik, min(task.gap, loglik - null)
             word = judge(pixel, limits, best, loglik - null, math.inf, math.inf, False)
-            return word, used[0], int(out[DEGREES])
+            out.evaluations += used[0]
+            return int(word)
     found = Found(-math.inf, -math.inf, np.bool_(False))
     for attempt in range(N_ATTEMPTS):
         clear = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
@@ -643,12 +636,14 @@ def search_density(
             break
         if limits.quick and found.loglik - null > limits.gap:
             break
+    out.evaluations += used[0]
     if not best[n + px.STEP] > 0.0:
-        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, used[0], 0
-    out[LOG_LIKELIHOOD], count = found.loglik, used[0]
+        out.freedom = 0
+        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED
+    out.log_likelihood = found.loglik
     blurred = above_blurred(pixel, tools, best, found.loglik)
-    out[GAP] = min(found.loglik - max(found.runner_up, null), blurred)
+    out.gap = min(found.loglik - max(found.runner_up, null), blurred)
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.runner_up)
     gap = found.loglik - found.runner_up
     word = judge(pixel, limits, best, found.loglik - null, blurred, gap, of_gain)
-    return word, count, int(out[DEGREES])
+    return int(word)

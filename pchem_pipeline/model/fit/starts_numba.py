@@ -22,7 +22,7 @@ from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MIN_STEP, min_log_variance, same_place, sensible
 from pchem_pipeline.model.law import pixel_numba as px
-from pchem_pipeline.model.law.pixel_numba import Histogram, Pixel, Scratch, copy, histogram_of
+from pchem_pipeline.model.law.pixel_numba import Pixel, Sample, Scratch, copy, sample_of
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a satellite
 N_FREQUENCIES = 48  # up to 4.8/sd, the satellite of H = 22
@@ -58,12 +58,12 @@ def regression_basis() -> FloatArray:
 
 
 @kernel(borrows=True)
-def _clenshaw(histogram: Histogram, first: int, end: int, work: FloatArray) -> None:
+def _clenshaw(histogram: Sample, first: int, end: int, work: FloatArray) -> None:
     """Leave b_0 and b_1 of Clenshaw's recurrence in ``work[2:4]``, from 2 cos(angle) in ``work[1]``.
 
     ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``; then ``sum c_i exp(i angle) = b_0 - b_1 exp(-i angle)``.
     """
-    weights, n_bins = histogram.weights, histogram.n_bins
+    weights, n_bins = histogram.bins[px.WEIGHT], histogram.facts.n_bins
     for m in range(first, end, _SIDE_BY_SIDE * SIMD_WIDTH):
         turn1, turn2 = simd_load(work, 1, m), simd_load(work, 1, m + SIMD_WIDTH)
         turn3 = simd_load(work, 1, m + 2 * SIMD_WIDTH)
@@ -86,7 +86,7 @@ def _clenshaw(histogram: Histogram, first: int, end: int, work: FloatArray) -> N
 
 
 @kernel(borrows=True)
-def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: FloatArray) -> None:
+def ecf_power(histogram: Sample, step: float, n_frequencies: int, work: FloatArray) -> None:
     """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``."""
     base = 2.0 * math.cos(math.tau * step)
     before, present = 2.0, base
@@ -94,24 +94,24 @@ def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: Float
         work[1, m] = present
         before, present = present, base * present - before
     _clenshaw(histogram, 0, n_frequencies, work)
-    share = 1.0 / (histogram.n * histogram.n)
+    share = 1.0 / (histogram.facts.n_frames * histogram.facts.n_frames)
     for m in range(0, n_frequencies, SIMD_WIDTH):
         turn, even, odd = simd_load(work, 1, m), simd_load(work, 2, m), simd_load(work, 3, m)
         simd_store(work, 0, m, share * (even * even + odd * odd - turn * even * odd))
 
 
 @kernel(borrows=True)
-def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
+def ecf_at(histogram: Sample, frequency: float) -> tuple[float, float]:
     """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
-    weights, angle = histogram.weights, math.tau * frequency
+    weights, angle = histogram.bins[px.WEIGHT], math.tau * frequency
     turn_c, turn_s = math.cos(angle), math.sin(angle)
-    c0, s0 = math.cos(angle * histogram.first), math.sin(angle * histogram.first)
+    c0, s0 = math.cos(angle * histogram.facts.first), math.sin(angle * histogram.facts.first)
     c1, s1 = c0 * turn_c - s0 * turn_s, c0 * turn_s + s0 * turn_c
     c2, s2 = c1 * turn_c - s1 * turn_s, c1 * turn_s + s1 * turn_c
     c3, s3 = c2 * turn_c - s2 * turn_s, c2 * turn_s + s2 * turn_c
     far_c, far_s = math.cos(4.0 * angle), math.sin(4.0 * angle)
     real = imag = 0.0
-    whole = histogram.n_bins // 4 * 4
+    whole = histogram.facts.n_bins // 4 * 4
     for i in range(0, whole, 4):  # four DN side by side: each waits for the one four before
         w0, w1, w2, w3 = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
         real += (w0 * c0 + w1 * c1) + (w2 * c2 + w3 * c3)
@@ -120,7 +120,7 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
         c1, s1 = c1 * far_c - s1 * far_s, c1 * far_s + s1 * far_c
         c2, s2 = c2 * far_c - s2 * far_s, c2 * far_s + s2 * far_c
         c3, s3 = c3 * far_c - s3 * far_s, c3 * far_s + s3 * far_c
-    for i in range(whole, histogram.n_bins):
+    for i in range(whole, histogram.facts.n_bins):
         real += weights[i] * c0
         imag += weights[i] * s0
         c0, s0 = c0 * turn_c - s0 * turn_s, c0 * turn_s + s0 * turn_c
@@ -183,7 +183,7 @@ def _regress(basis: FloatArray, power: FloatArray, floor: float, sums: FloatArra
 
 
 @kernel(borrows=True)
-def assemble(histogram: Histogram, a: float, exposure: float, theta: FloatArray) -> tuple[bool, bool]:
+def assemble(histogram: Sample, a: float, exposure: float, theta: FloatArray) -> tuple[bool, bool]:
     """Turn a step and a rough H into a start; return whether there is one, and whether its lobe is clear."""
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
@@ -193,10 +193,11 @@ def assemble(histogram: Histogram, a: float, exposure: float, theta: FloatArray)
 
 @kernel(borrows=True)
 def _on_lobe(
-    histogram: Histogram, a: float, exposure: float, lobe: tuple[float, float], theta: FloatArray
+    histogram: Sample, a: float, exposure: float, lobe: tuple[float, float], theta: FloatArray
 ) -> bool:
     """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; return whether it is clear."""
-    _, _, _, _, n, mean, variance = histogram
+    facts = histogram.facts
+    n, mean, variance = facts.n_frames, facts.mean, facts.variance
     modulus, phase = lobe[0] / n, lobe[1]
     least = _CLEAR / math.sqrt(n)
     clear = modulus > least
@@ -226,10 +227,10 @@ def _on_lobe(
 
 @kernel(borrows=True)
 def start_regression(
-    histogram: Histogram, basis: FloatArray, work: FloatArray, theta: FloatArray
+    histogram: Sample, basis: FloatArray, work: FloatArray, theta: FloatArray
 ) -> tuple[bool, bool]:
     """Start from the regression on log|phi|, see `assemble`; ``work`` has seven rows."""
-    n, variance = histogram.n, histogram.variance
+    n, variance = histogram.facts.n_frames, histogram.facts.variance
     sd = math.sqrt(variance)
     n_used = min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP))
     ecf_power(histogram, FREQUENCY_STEP / sd, n_used, work)
@@ -246,15 +247,15 @@ def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Sc
 
     Some read noises are tried, and exposures, so many to either side of the one that has the variance right.
     """
-    histogram, trial = histogram_of(pixel, 0), scratch.small[px.HERE]
+    histogram, trial = sample_of(pixel, 0), scratch.small[px.HERE]
     trial[1 + px.STEP], trial[1 + px.SATELLITE] = a, 0.0
     for noise in _FEW_NOISES:
-        middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
+        middle = (histogram.facts.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
         trial[1 + px.LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, True))
         for place in range(-around, around + 1):
             exposure = middle + 0.2 * place
             if exposure > 1e-3:
-                trial[0], trial[1 + px.BIAS] = math.log(exposure), histogram.mean - exposure * a
+                trial[0], trial[1 + px.BIAS] = math.log(exposure), histogram.facts.mean - exposure * a
                 keep_start(pixel, evaluate, True, scratch)
 
 
@@ -266,7 +267,7 @@ def _keep_lobe(
 
     Of few DN per electron and a low H other frequencies add to the lobe; there some read noises are tried.
     """
-    histogram, trial = histogram_of(pixel, 0), scratch.small[px.HERE]
+    histogram, trial = sample_of(pixel, 0), scratch.small[px.HERE]
     trial[1 + px.SATELLITE] = 0.0
     _on_lobe(histogram, a, math.inf, lobe, trial)
     if cells:
@@ -287,11 +288,11 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> No
     closer than the likelihood's maxima. Past the central lobe few are tried of those that stay in the noise,
     ``3 / sqrt(N)``.
     """
-    histogram, work = histogram_of(pixel, 0), scratch.rows
+    histogram, work = sample_of(pixel, 0), scratch.rows
     no_starts(scratch.small[px.HEIGHTS])
-    first, sd = work.shape[1] - px.SCANNED, math.sqrt(histogram.variance)
+    first, sd = work.shape[1] - px.SCANNED, math.sqrt(histogram.facts.variance)
     highest = min(max(_SCAN_END / sd, 1.0 / FEW_STEP), 1.0 / (LEAST_STEP if cells else MIN_STEP))
-    end, frequency = first, 1.0 / (histogram.n_bins + 1.0)
+    end, frequency = first, 1.0 / (histogram.facts.n_bins + 1.0)
     while frequency < highest and end < work.shape[1] - _SIDE_BY_SIDE * SIMD_WIDTH:
         work[0, end], work[1, end] = frequency, 2.0 * math.cos(math.tau * frequency)
         frequency += min(_SCAN_SHARE * frequency, _SCAN_STEP / sd)
@@ -306,9 +307,12 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> No
         imaginary = work[3, m] * math.sin(math.tau * frequency)
         lobe = (
             math.hypot(real, imaginary),
-            math.atan2(imaginary, real) + math.tau * frequency * histogram.first,
+            math.atan2(imaginary, real) + math.tau * frequency * histogram.facts.first,
         )
-        central, clear = frequency * sd < _CENTRAL_LOBE, lobe[0] > _CLEAR * math.sqrt(histogram.n)
+        central, clear = (
+            frequency * sd < _CENTRAL_LOBE,
+            lobe[0] > _CLEAR * math.sqrt(histogram.facts.n_frames),
+        )
         if central or clear or frequency > _UNRESOLVED * last:
             last = frequency
             _keep_lobe(pixel, evaluate, cells, 1.0 / frequency, lobe, scratch)
@@ -344,7 +348,7 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratc
     if n > 1:
         _keep_rescaled(pixel, evaluate, cells, best, a / best[n + px.STEP], scratch)
     else:
-        _keep_lobe(pixel, evaluate, cells, a, ecf_at(histogram_of(pixel, 0), 1.0 / a), scratch)
+        _keep_lobe(pixel, evaluate, cells, a, ecf_at(sample_of(pixel, 0), 1.0 / a), scratch)
 
 
 @kernel(borrows=True)
@@ -355,16 +359,17 @@ def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> No
 
 
 @kernel(borrows=True)
-def _holds_one(histogram: Histogram, theta: FloatArray) -> bool:
+def _holds_one(histogram: Sample, theta: FloatArray) -> bool:
     """Return whether more than 0.4 of the samples expected in the peak of one electron are near it."""
     exposure, a, noise = math.exp(theta[0]), theta[1], math.exp(0.5 * theta[3])
-    empty = histogram.n * math.exp(-exposure)
-    middle = theta[2] + a - histogram.first
-    low = min(max(int(middle - 0.25 * a + 1.0), 0), histogram.n_bins)
-    high = min(max(int(middle + 0.25 * a + 1.0), low), histogram.n_bins)
+    facts, cumulative = histogram.facts, histogram.bins[px.CUMULATIVE]
+    empty = facts.n_frames * math.exp(-exposure)
+    middle = theta[2] + a - facts.first
+    low = min(max(int(middle - 0.25 * a + 1.0), 0), facts.n_bins)
+    high = min(max(int(middle + 0.25 * a + 1.0), low), facts.n_bins)
     tail = 0.5 * empty * math.erfc(0.75 * a / noise / math.sqrt(2.0))
-    seen = histogram.cumulative[high] - histogram.cumulative[low] - tail
-    return empty * exposure > _COUNTED and seen > _HELD * empty * exposure
+    seen = cumulative[high] - cumulative[low] - tail
+    return bool(empty * exposure > _COUNTED and seen > _HELD * empty * exposure)
 
 
 @kernel(borrows=True)
@@ -378,17 +383,17 @@ def longer_steps(
     exposure. Starts below ``least`` are left out.
     """
     cells = False
-    histogram, heights = histogram_of(pixel, 0), scratch.small[px.HEIGHTS]
+    histogram, heights = sample_of(pixel, 0), scratch.small[px.HEIGHTS]
     no_starts(heights)
     n = pixel.facts.shape[0]
     a = best[n + px.STEP]
     for j in range(n):
-        if not (pixel.facts[j, px.VARIANCE] < _SPARSE * a * a or (n > 1 and poor)):
+        if not (pixel.facts[j].variance < _SPARSE * a * a or (n > 1 and poor)):
             return
     if n == 1 and _holds_one(histogram, best):
         return
     for multiple in (1.3, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0):
-        if n == 1 and multiple * a < histogram.n_bins:
+        if n == 1 and multiple * a < histogram.facts.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
             _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
         elif n > 1:
@@ -412,12 +417,12 @@ def fill_theta(pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, 
     for j in range(n_samples):
         facts = pixel.facts[j]
         exposure = 0.0
-        if facts[px.DARK] == 0.0:
-            exposure = max((facts[px.CENTRE] + facts[px.MEAN] - bias) / a, _SMALLEST_EXPOSURE)
+        if not facts.dark:
+            exposure = max((facts.centre + facts.mean - bias) / a, _SMALLEST_EXPOSURE)
         brightest = max(brightest, exposure)
         theta[j] = math.log(max(exposure, 1e-6))
-        weight = facts[px.N_FRAMES] / (1.0 + exposure)
-        rest += weight * (facts[px.VARIANCE] - exposure * a * a)
+        weight = facts.n_frames / (1.0 + exposure)
+        rest += weight * (facts.variance - exposure * a * a)
         n += weight
     if noise2 < 0.0:
         noise2 = max(rest / n, 0.02 * a * a)
@@ -438,18 +443,18 @@ def variance_line(pixel: Pixel) -> tuple[float, float, float]:
     weight_sum = x_sum = y_sum = 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        weight = facts[px.N_FRAMES] / max(facts[px.VARIANCE] ** 2, 1e-6)
+        weight = facts.n_frames / max(facts.variance**2, 1e-6)
         weight_sum += weight
-        x_sum += weight * (facts[px.CENTRE] + facts[px.MEAN])
-        y_sum += weight * facts[px.VARIANCE]
+        x_sum += weight * (facts.centre + facts.mean)
+        y_sum += weight * facts.variance
     x0, y0 = x_sum / weight_sum, y_sum / weight_sum
     xx = xy = 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        weight = facts[px.N_FRAMES] / max(facts[px.VARIANCE] ** 2, 1e-6)
-        x = facts[px.CENTRE] + facts[px.MEAN] - x0
+        weight = facts.n_frames / max(facts.variance**2, 1e-6)
+        x = facts.centre + facts.mean - x0
         xx += weight * x * x
-        xy += weight * x * (facts[px.VARIANCE] - y0)
+        xy += weight * x * (facts.variance - y0)
     return (xy / xx if xx > 0.0 else 0.0), x0, y0
 
 
@@ -471,11 +476,11 @@ def _line_start(
     noise2 = (noise * a) ** 2
     bias = x0 - (y0 - noise2) / a
     for j in range(pixel.facts.shape[0]):
-        if pixel.facts[j, px.DARK] > 0.0:  # it knows bias and read noise by itself
+        if pixel.facts[j].dark:  # it knows bias and read noise by itself
             if not first:
                 return False
-            bias = pixel.facts[j, px.CENTRE] + pixel.facts[j, px.MEAN]
-            noise2 = pixel.facts[j, px.VARIANCE]
+            bias = pixel.facts[j].centre + pixel.facts[j].mean
+            noise2 = pixel.facts[j].variance
     answer: bool = fill_theta(pixel, a, bias, noise2, cells, theta)
     return answer
 
@@ -486,18 +491,18 @@ def _regression_start(
 ) -> tuple[bool, bool]:
     """Fill ``theta`` with the start from the regression of sample j, see `assemble`."""
     facts = pixel.facts
-    if facts[j, px.DARK] > 0.0 or facts[j, px.OCCUPIED] < 3:
+    if facts[j].dark or facts[j].occupied < 3:
         return False, False
     own = scratch.small[px.OTHER]
-    found, clear = start_regression(histogram_of(pixel, j), basis, scratch.rows, own)
+    found, clear = start_regression(sample_of(pixel, j), basis, scratch.rows, own)
     if not found:
         return False, False
-    bias = facts[j, px.CENTRE] + own[2]
+    bias = facts[j].centre + own[2]
     noise2 = math.exp(own[3])
     for i in range(facts.shape[0]):
-        if facts[i, px.DARK] > 0.0:
-            bias = facts[i, px.CENTRE] + facts[i, px.MEAN]
-            noise2 = facts[i, px.VARIANCE]
+        if facts[i].dark:
+            bias = facts[i].centre + facts[i].mean
+            noise2 = facts[i].variance
     return fill_theta(pixel, own[1], bias, noise2, False, theta), clear
 
 
@@ -549,7 +554,7 @@ def fill_starts(
             return False
         start = scratch.small[px.KEPT_STARTS]
         start[1 + px.SATELLITE] = trial[1 + px.SATELLITE] = 0.0
-        found, clear = start_regression(histogram_of(pixel, 0), basis, scratch.rows, start)
+        found, clear = start_regression(sample_of(pixel, 0), basis, scratch.rows, start)
         if clear or (quick and found):
             heights[0] = 0.0
         return False

@@ -18,7 +18,6 @@ from pchem_pipeline.model.fit.climb_numba import Limits, min_log_variance
 from pchem_pipeline.model.fit.search_numba import (
     FIT_NOT_CONVERGED,
     GAIN_AMBIGUOUS,
-    LOG_LIKELIHOOD,
     NO_DATA,
     SURELY_SEEN,
     TOO_FEW_BINS,
@@ -34,15 +33,11 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     Scratch,
     copy,
-    histogram_of,
     load,
     make_pixel,
     make_scratch,
+    sample_of,
 )
-
-# columns of `words`
-STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN, FRAMES = range(6)
-N_WORDS = 6
 
 
 class Histograms(NamedTuple):
@@ -78,8 +73,7 @@ class Answers(NamedTuple):
     parameters: FloatArray  # (H_1 ... H_J, g, mu, sigma), shape (n, J + 3); comes as NaN
     covariance: FloatArray  # shape (n, J + 3, J + 3); comes as NaN
     moments: FloatArray  # mean (DN) and variance (DN^2) of each sample, shape (n, J, 2); comes as NaN
-    out: FloatArray  # shape (n, N_OUT), see :mod:`.search_numba`; comes as NaN
-    words: IntArray  # shape (n, N_WORDS); comes as 0
+    found: NDArray[np.void]  # shape (n,), see :data:`.search_numba.RESULT`; comes as 0
 
 
 @kernel
@@ -92,27 +86,27 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
         own += given.origin[index, j]
         if j == 0:
             centre = own
-        room.facts[j, px.CENTRE] = float(own - centre)
-        widest = max(widest, room.facts[j, px.N_BINS])
-    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
+        room.facts[j].centre = float(own - centre)
+        widest = max(widest, room.facts[j].n_bins)
+    return Pixel(room.bins, room.facts, room.laws, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
 
 
 @kernel(borrows=True)
-def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float, float]:
+def describe(pixel: Pixel, moments: FloatArray, out: Any) -> tuple[float, float]:
     """Fill moments, frames and extreme codes; return the fewest frames and the most occupied bins."""
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
     for j in range(pixel.facts.shape[0]):
         facts = pixel.facts[j]
-        n += facts[px.N_FRAMES]
-        least = min(least, facts[px.N_FRAMES])
-        if facts[px.DARK] == 0.0:
-            occupied = max(occupied, facts[px.OCCUPIED])
-        if facts[px.N_FRAMES] > 0.0:
-            moments[j, 0] = pixel.centre + facts[px.CENTRE] + facts[px.MEAN]
-            moments[j, 1] = facts[px.VARIANCE]
-            first = pixel.centre + int(facts[px.CENTRE] + facts[px.FIRST])
-            lowest, highest = min(lowest, first), max(highest, first + int(facts[px.N_BINS]) - 1)
-    words[LOWEST_DN], words[HIGHEST_DN], words[FRAMES] = lowest, highest, int(n)
+        n += facts.n_frames
+        least = min(least, facts.n_frames)
+        if not facts.dark:
+            occupied = max(occupied, facts.occupied)
+        if facts.n_frames > 0.0:
+            moments[j, 0] = pixel.centre + facts.centre + facts.mean
+            moments[j, 1] = facts.variance
+            first = pixel.centre + int(facts.centre + facts.first)
+            lowest, highest = min(lowest, first), max(highest, first + facts.n_bins - 1)
+    out.lowest_dn, out.highest_dn, out.frames = lowest, highest, int(n)
     return least, occupied
 
 
@@ -127,7 +121,7 @@ def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatA
     if not math.isfinite(known):
         return False
     for j in range(n):
-        dark = pixel.facts[j, px.DARK] > 0.0 or not parameters[j] > 0.0
+        dark = pixel.facts[j].dark or not parameters[j] > 0.0
         theta[j] = limits.bound if dark else math.log(parameters[j])
     theta[n + px.STEP] = 1.0 / parameters[n]
     theta[n + px.BIAS] = parameters[n + 1] - pixel.centre
@@ -177,9 +171,9 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
     theta = scratch.small[px.HERE]
     for index in range(given.counts.shape[0]):
         pixel = load_pixel(given, index, room)
-        if pixel.facts[0, px.OCCUPIED] < 3:
+        if pixel.facts[0].occupied < 3:
             continue
-        if start_regression(histogram_of(pixel, 0), basis, scratch.rows, theta)[0]:
+        if start_regression(sample_of(pixel, 0), basis, scratch.rows, theta)[0]:
             parameters[index, 0] = math.exp(theta[0])
             parameters[index, 1] = 1.0 / theta[1 + px.STEP]
             parameters[index, 2] = theta[1 + px.BIAS] + pixel.centre
@@ -244,12 +238,12 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
             fixed[j] = given.dark[j]
         for index in chosen:
             pixel = load_pixel(given, index, room)
-            out, words = answers.out[index], answers.words[index]
-            least, occupied = describe(pixel, answers.moments[index], words)
-            for i in range(out.size):
-                out[i] = math.nan
+            out = answers.found[index]
+            least, occupied = describe(pixel, answers.moments[index], out)
+            out.log_likelihood = out.gap = out.chi2 = out.outlying = out.amplitude = out.weight = math.nan
+            out.freedom = 0
             if least == 0.0 or occupied < 3.0:
-                words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
+                out.status = NO_DATA if least == 0.0 else TOO_FEW_BINS
                 continue
             if limits.cells:
                 resolve(law, index, 0.0, pixel)
@@ -260,18 +254,17 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
             tried = starts.looked[index if starts.looked.size > 1 else 0]
             amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
             task = Task(law, index, amplitudes, near, gap)
-            status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
-            words[EVALUATIONS] += used
+            status = search(pixel, tools, task, best, out)
             if best[n + px.STEP] > 0.0:
                 parameters, covariance = answers.parameters[index], answers.covariance[index]
                 if not plain and n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
-                    if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
+                    if ripple_by_chance(pixel, tools, best, out.log_likelihood):
                         status |= GAIN_AMBIGUOUS
                     if not limits.sandwich:
                         _expect_information(pixel, best, limits, evaluate, scratch)
                 if not _write(pixel, best, limits, scratch, parameters, covariance):
                     status |= FIT_NOT_CONVERGED
-            words[STATUS] = status
+            out.status = status
 
     compiled: Callable[..., None] = fit_tile
     return compiled

@@ -15,6 +15,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
@@ -32,7 +35,7 @@ from pchem_pipeline.model.arithmetic.simd_numba import (
 )
 from pchem_pipeline.model.law import pixel_numba as px
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
+from pchem_pipeline.model.law.pixel_numba import Pixel, Sample, Scratch, sample_of
 
 # places in a sample's own parameters
 _EXPOSURE, _STEP, _BIAS, _VARIANCE, _SATELLITE = range(px.N_BLOCK)
@@ -51,71 +54,22 @@ class Law(NamedTuple):
     """The laws of J samples as the loops take them, see :mod:`pchem_pipeline.model.law.sample_law`.
 
     Attributes:
-        numbers: columns ``COUNT_LAW`` ... ``EDGE_FIRST`` of a pixel's facts, shape (J, 1 or n, 10).
-        own: level scale, level shift (e-), extra variance (e-^2, DN^2), shape (J, 1 or n, 4).
+        numbers: see :data:`.pixel_numba.LAW`, shape (J, 1 or n, 1).
         peaks: weight, shifts (e-, DN, sigma) and width of the noise's levels, shape (J, 1 or n, 5, enough).
         n_peaks: levels in use, shape (J,).
         exposures: weights and factors of the exposures, shape (J, 1 or n, 2, enough).
         added: weights and values (e-) of added exposures, shape (J, 1 or n, 2, enough).
-        edge_shift: shifts of the code edges from ``EDGE_FIRST`` on, DN, shape (J, 1 or n, enough).
+        edge_shift: shifts of the code edges from ``edge_first`` on, DN, shape (J, 1 or n, enough).
         pattern: shift, in units of the amplitude, and weight of free satellites, shape (enough, 2).
     """
 
-    numbers: FloatArray
-    own: FloatArray
+    numbers: NDArray[np.void]
     peaks: FloatArray
     n_peaks: IntArray
     exposures: FloatArray
     added: FloatArray
     edge_shift: FloatArray
     pattern: FloatArray
-
-
-class Cells(NamedTuple):
-    """One sample: its counts, the edges of its cells, and what the law says of it.
-
-    Attributes:
-        bins: counts, lower edges of the cells and the upper edge of the last one, less the centre, and 1 for
-            codes that are not set aside, see :class:`.pixel_numba.Pixel`; an edge is infinite where
-            everything beyond is counted in the cell.
-        n_bins: cells in use.
-        bottom: last edge at minus infinity, -1 without one.
-        top: first edge at infinity, n_bins + 1 without one.
-        margin: largest distance of a finite edge from its place ``i`` after ``first``, DN.
-        first: place of the first edge, less the centre, without any shift.
-        frames: samples counted.
-        conditional: whether codes are set aside.
-        peaks: levels of the noise, shape (N_PEAK_ROWS, at least n_peaks).
-        n_peaks: levels in use.
-        mixtures: of exposures, see :class:`.pixel_numba.Pixel`.
-        count_law, dispersion: of the electron number.
-        level_scale, level_shift, curvature: of the comb; e-.
-        extra_e2, extra_dn2, per_electron, per_electron2: variance, e-^2 and DN^2.
-        outlier_share, outlier_mass: of samples that can be anything, and in each code.
-    """
-
-    bins: FloatArray
-    n_bins: int
-    bottom: int
-    top: int
-    margin: float
-    first: float
-    frames: float
-    conditional: bool
-    peaks: FloatArray
-    n_peaks: int
-    mixtures: FloatArray
-    count_law: int
-    dispersion: float
-    level_scale: float
-    level_shift: float
-    curvature: float
-    extra_e2: float
-    extra_dn2: float
-    per_electron: float
-    per_electron2: float
-    outlier_share: float
-    outlier_mass: float
 
 
 class Component(NamedTuple):
@@ -140,7 +94,7 @@ class Component(NamedTuple):
 
 
 @kernel(inline=True, borrows=True)
-def _row(values: FloatArray, index: int) -> int:
+def _row(values: NDArray[np.generic], index: int) -> int:
     """Return the row of a pixel in an array with one row for all, or one for each."""
     return index if values.shape[1] > 1 else 0
 
@@ -166,7 +120,7 @@ def set_peaks(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
                     peaks[px.SHARE, count] = 0.0
                     peaks[px.SHARE_SLOPE, count] = weight * law.pattern[side, 1]
                 count += 1
-        pixel.facts[j, px.N_PEAKS] = float(count)
+        pixel.facts[j].n_peaks = count
 
 
 @kernel(borrows=True)
@@ -176,12 +130,8 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     The amplitude is that of free satellites, e-; 0: none.
     """
     for j in range(pixel.facts.shape[0]):
-        facts, edges = pixel.facts[j], pixel.bins[j, px.EDGE]
-        row = _row(law.numbers, index)
-        for i in range(law.numbers.shape[2]):
-            facts[px.COUNT_LAW + i] = law.numbers[j, row, i]
-        for i in range(4):
-            facts[px.LEVEL_SCALE + i] = law.own[j, _row(law.own, index), i]
+        pixel.laws[j] = law.numbers[j, _row(law.numbers, index), 0]
+        facts, own, edges = pixel.facts[j], pixel.laws[j], pixel.bins[j, px.EDGE]
         row = _row(law.exposures, index)
         for i in range(law.exposures.shape[3]):
             pixel.mixtures[j, px.EXPOSURE_WEIGHT, i] = law.exposures[j, row, 0, i]
@@ -189,102 +139,71 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
         for i in range(law.added.shape[3]):
             pixel.mixtures[j, px.ADDED_WEIGHT, i] = law.added[j, _row(law.added, index), 0, i]
             pixel.mixtures[j, px.ADDED_EXPOSURE, i] = law.added[j, _row(law.added, index), 1, i]
-        n_bins, first = int(facts[px.N_BINS]), facts[px.FIRST]
-        code = pixel.centre + int(facts[px.CENTRE] + first)
+        n_bins, first = facts.n_bins, facts.first
+        code = pixel.centre + int(facts.centre + first)
         margin = 0.0
         bottom, top = -1, n_bins + 1
-        n_shifts, edge_first = law.edge_shift.shape[2], int(facts[px.EDGE_FIRST])
+        n_shifts, edge_first = law.edge_shift.shape[2], own.edge_first
         row = _row(law.edge_shift, index)
         for i in range(n_bins + 1):
             place = code + i - edge_first
             shift = law.edge_shift[j, row, place] if 0 <= place < n_shifts else 0.0
             margin = max(margin, abs(shift))
             edges[i] = first + i - 0.5 + shift
-            if code + i <= facts[px.CLIP_LOW]:
+            if code + i <= own.clip_low:
                 edges[i], bottom = -math.inf, i
-            elif code + i > facts[px.CLIP_HIGH]:
+            elif code + i > own.clip_high:
                 edges[i], top = math.inf, min(top, i)
         for i in range(n_bins + 1, n_bins + 1 + SIMD_WIDTH):
             edges[i] = math.inf
-        facts[px.BOTTOM], facts[px.TOP], facts[px.MARGIN] = float(bottom), float(top), margin
+        facts.bottom, facts.top, facts.margin = bottom, top, margin
     set_peaks(law, index, amplitude, pixel)
 
 
-@kernel(views=True)
-def cells_of(pixel: Pixel, j: int) -> Cells:
-    """Return one sample as the loops below take it."""
-    bins, facts = pixel.bins[j], pixel.facts[j]
-    return Cells(
-        bins,
-        int(facts[px.N_BINS]),
-        int(facts[px.BOTTOM]),
-        int(facts[px.TOP]),
-        facts[px.MARGIN],
-        facts[px.FIRST] - 0.5,
-        facts[px.N_FRAMES],
-        facts[px.CONDITIONAL] > 0.0,
-        pixel.peaks[j],
-        int(facts[px.N_PEAKS]),
-        pixel.mixtures[j],
-        int(facts[px.COUNT_LAW]),
-        facts[px.DISPERSION],
-        facts[px.LEVEL_SCALE],
-        facts[px.LEVEL_SHIFT],
-        facts[px.CURVATURE],
-        facts[px.EXTRA_E2],
-        facts[px.EXTRA_DN2],
-        facts[px.PER_ELECTRON],
-        facts[px.PER_ELECTRON2],
-        facts[px.OUTLIER_SHARE],
-        facts[px.OUTLIER_MASS],
-    )
-
-
 @kernel(inline=True, borrows=True)
-def _level(k: float, cells: Cells) -> float:
+def _level(k: float, cells: Sample) -> float:
     """Return the level of k electrons, e-."""
-    return cells.level_scale * k * (1.0 + 0.5 * cells.curvature * (k - 1.0)) + cells.level_shift
+    law = cells.law
+    return float(law.level_scale * k * (1.0 + 0.5 * law.curvature * (k - 1.0)) + law.level_shift)
 
 
 @kernel(borrows=True)
-def component(k: float, peak: int, theta: FloatArray, cells: Cells, reach: float) -> Component:
+def component(k: float, peak: int, theta: FloatArray, cells: Sample, reach: float) -> Component:
     """Return one electron number at one level; ``low >= high`` where it gives nothing to the cells."""
     a, analog2 = theta[_STEP], math.exp(theta[_VARIANCE])
-    peaks = cells.peaks
+    peaks, facts, law = cells.peaks, cells.facts, cells.law
     charge = _level(k, cells) + peaks[px.SHIFT_E, peak]
     by_sigma = peaks[px.SHIFT_SIGMA, peak] * math.sqrt(analog2)
     mean = theta[_BIAS] + a * charge + peaks[px.SHIFT_DN, peak] + by_sigma
     own = peaks[px.WIDTH, peak] * peaks[px.WIDTH, peak] * analog2
-    spread = cells.extra_e2 + k * (cells.per_electron + k * cells.per_electron2)
-    variance = max(own + a * a * spread + cells.extra_dn2, LEAST_VARIANCE)
+    spread = law.extra_e2 + k * (law.per_electron + k * law.per_electron2)
+    variance = max(own + a * a * spread + law.extra_dn2, LEAST_VARIANCE)
     sd = math.sqrt(variance)
-    place = mean - cells.first
-    n = float(cells.n_bins)
-    low = int(min(max(place - reach * sd - cells.margin, 0.0), n))
-    high = int(min(max(place + reach * sd + cells.margin + 1.0, 0.0), n))
+    place = mean - (facts.first - 0.5)
+    n = float(facts.n_bins)
+    low = int(min(max(place - reach * sd - facts.margin, 0.0), n))
+    high = int(min(max(place + reach * sd + facts.margin + 1.0, 0.0), n))
     # what lies beyond the limits belongs to the first or last code that comes out
-    high = min(max(high, cells.bottom + 1), cells.n_bins)
-    low = max(min(low, cells.top - 1), 0)
-    if (
-        peaks[px.SHARE, peak] + theta[_SATELLITE] * peaks[px.SHARE_SLOPE, peak]
-        == peaks[px.SHARE_SLOPE, peak]
-        == 0.0
-    ):
+    high = min(max(high, facts.bottom + 1), facts.n_bins)
+    low = max(min(low, facts.top - 1), 0)
+    slope = peaks[px.SHARE_SLOPE, peak]
+    if peaks[px.SHARE, peak] + theta[_SATELLITE] * slope == slope == 0.0:
         high = low
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
 
 @kernel(inline=True, borrows=True)
-def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, numbers: FloatArray) -> int:
+def _list_numbers(theta: FloatArray, cells: Sample, reach: float, cut: float, numbers: FloatArray) -> int:
     """Fill the electron numbers that reach the cells, with their probabilities; return how many."""
     a, analog2, exposure = theta[_STEP], math.exp(theta[_VARIANCE]), math.exp(theta[_EXPOSURE])
+    facts, law = cells.facts, cells.law
     widest = farthest = 0.0
-    for peak in range(cells.n_peaks):
+    for peak in range(cells.facts.n_peaks):
         widest = max(widest, cells.peaks[px.WIDTH, peak])
         shift = a * abs(cells.peaks[px.SHIFT_E, peak]) + abs(cells.peaks[px.SHIFT_DN, peak])
         farthest = max(farthest, shift + abs(cells.peaks[px.SHIFT_SIGMA, peak]) * math.sqrt(analog2))
-    from_below, to_above = cells.bottom >= 0, cells.top <= cells.n_bins
-    last = cells.first + cells.n_bins + cells.margin
+    from_below, to_above = facts.bottom >= 0, facts.top <= facts.n_bins
+    last = facts.first - 0.5 + facts.n_bins + facts.margin
     factor = added = 0.0
     for i in range(cells.mixtures.shape[1]):
         factor = max(factor, cells.mixtures[px.EXPOSURE_FACTOR, i])
@@ -294,15 +213,15 @@ def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, num
     k = 0.0
     while count < numbers.shape[0]:
         level = _level(k, cells)
-        spread = cells.extra_e2 + k * (cells.per_electron + k * cells.per_electron2)
-        around = farthest + reach * math.sqrt(widest * widest * analog2 + a * a * spread + cells.extra_dn2)
+        spread = law.extra_e2 + k * (law.per_electron + k * law.per_electron2)
+        around = farthest + reach * math.sqrt(widest * widest * analog2 + a * a * spread + law.extra_dn2)
         mean = theta[_BIAS] + a * level
         if level <= previous or (mean - around > last and not to_above):
             break
         previous = level
-        if from_below or mean + around > cells.first - cells.margin:
+        if from_below or mean + around > facts.first - 0.5 - facts.margin:
             mass, slope, bend = electron_number(
-                cells.count_law, cells.dispersion, int(k), exposure, cells.mixtures
+                law.count_law, law.dispersion, int(k), exposure, cells.mixtures
             )
             if mass > cut:
                 numbers[count, 0], numbers[count, 1] = k, mass
@@ -339,9 +258,9 @@ def _fill_edges(bins: FloatArray, part: Component, edges: FloatArray, place: int
 
 
 @kernel(inline=True, borrows=True)
-def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
+def cell_of(mean: float, cells: Sample, low: int, high: int) -> int:
     """Return the cell that holds a mean, if it is one of these, the end excluded, or one outside."""
-    middle = int(min(max(mean - cells.first, low - 1.0), float(high)))
+    middle = int(min(max(mean - (cells.facts.first - 0.5), low - 1.0), float(high)))
     while middle < high and cells.bins[px.EDGE, middle + 1] <= mean:
         middle += 1
     while middle >= low and cells.bins[px.EDGE, middle] > mean:
@@ -354,7 +273,7 @@ def _add_component(
     row: FloatArray,
     peak: int,
     satellite: float,
-    cells: Cells,
+    cells: Sample,
     part: Component,
     edges: FloatArray,
     place: int,
@@ -397,7 +316,7 @@ def _add_component(
 @kernel(borrows=True)
 def fill_masses(
     theta: FloatArray,
-    cells: Cells,
+    cells: Sample,
     stage: int,
     what: int,
     numbers: FloatArray,
@@ -411,22 +330,22 @@ def fill_masses(
     """
     reach, cut = _REACH[stage], _CUT[stage]
     for row in range(1 if what == px.LOGLIK_ALONE else px.N_BLOCK + 1):
-        for i in range(0, cells.n_bins, SIMD_WIDTH):
+        for i in range(0, cells.facts.n_bins, SIMD_WIDTH):
             simd_store(room, px.MASS if row == 0 else px.SLOPES + row - 1, i, 0.0)
     count: int = _list_numbers(theta, cells, reach, cut, numbers)
     following = 0
     for row in range(count):
-        for peak in range(cells.n_peaks):
+        for peak in range(cells.facts.n_peaks):
             part = component(numbers[row, 0], peak, theta, cells, reach)
             if part.low >= part.high:
                 continue
             place, following = _place_for(part, following)
             _fill_edges(cells.bins, part, edges, place)
             _add_component(numbers[row], peak, theta[_SATELLITE], cells, part, edges, place, what, room)
-    if cells.outlier_share > 0.0:
-        rest = 1.0 - cells.outlier_share
-        for i in range(cells.n_bins):
-            room[px.MASS, i] = rest * room[px.MASS, i] + cells.outlier_mass
+    if cells.law.outlier_share > 0.0:
+        rest = 1.0 - cells.law.outlier_share
+        for i in range(cells.facts.n_bins):
+            room[px.MASS, i] = rest * room[px.MASS, i] + cells.law.outlier_mass
             for j in range(px.N_BLOCK):
                 room[px.SLOPES + j, i] *= rest
     return count
@@ -434,7 +353,7 @@ def fill_masses(
 
 @kernel(borrows=True)
 def fill_far_enough(
-    theta: FloatArray, cells: Cells, what: int, numbers: FloatArray, edges: FloatArray, room: FloatArray
+    theta: FloatArray, cells: Sample, what: int, numbers: FloatArray, edges: FloatArray, room: FloatArray
 ) -> tuple[int, float]:
     """Fill mass and slopes of the cells, exact also where an occupied one lies far out.
 
@@ -444,7 +363,7 @@ def fill_far_enough(
     for stage in range(len(_REACH)):  # the last one is taken whatever the masses are, NaN too
         count = fill_masses(theta, cells, stage, what, numbers, edges, room)
         lowest = 1.0
-        for i in range(cells.n_bins):
+        for i in range(cells.facts.n_bins):
             if cells.bins[px.WEIGHT, i] > 0.0:
                 lowest = min(lowest, room[px.MASS, i])
         if lowest >= _OUTLIER[stage]:
@@ -453,66 +372,66 @@ def fill_far_enough(
 
 
 @kernel(inline=True, borrows=True)
-def _log_mass(cells: Cells, room: FloatArray) -> float:
+def _log_mass(cells: Sample, room: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
-    for i in range(0, cells.n_bins, SIMD_WIDTH):
+    for i in range(0, cells.facts.n_bins, SIMD_WIDTH):
         weight, own = simd_load(cells.bins, px.WEIGHT, i), most(simd_load(room, px.MASS, i), SMALLEST_MASS)
         total = fused(weight, simd_log(own), total)
-    if cells.conditional:
+    if cells.facts.conditional:
         inside = 0.0
-        for i in range(cells.n_bins):
+        for i in range(cells.facts.n_bins):
             inside += cells.bins[px.KEPT, i] * room[px.MASS, i]
-    return float(simd_sum(total)) - cells.frames * math.log(max(inside, SMALLEST_MASS))
+    return float(simd_sum(total) - cells.facts.n_frames * math.log(max(inside, SMALLEST_MASS)))
 
 
 @kernel(inline=True, borrows=True)
-def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
+def _sum_up(cells: Sample, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room; add score and squared scores, fill ratios."""
     total = counting() * 0.0
-    for i in range(0, cells.n_bins, SIMD_WIDTH):
+    for i in range(0, cells.facts.n_bins, SIMD_WIDTH):
         weight, own = simd_load(cells.bins, px.WEIGHT, i), most(simd_load(room, px.MASS, i), SMALLEST_MASS)
         total = fused(weight, simd_log(own), total)
         # a mass that is hardly one has no slope
         per_mass = least((own - SMALLEST_MASS) * _TO_ONE, 1.0) / own
         simd_store(room, px.PER_MASS, i, per_mass)
         simd_store(room, px.RATIO, i, weight * per_mass)
-    simd_store(room, px.RATIO, cells.n_bins, 0.0)
+    simd_store(room, px.RATIO, cells.facts.n_bins, 0.0)
     loglik = float(simd_sum(total))
     for row in range(px.N_BLOCK):
         score = counting() * 0.0
-        for i in range(0, cells.n_bins, SIMD_WIDTH):
+        for i in range(0, cells.facts.n_bins, SIMD_WIDTH):
             score = fused(simd_load(room, px.RATIO, i), simd_load(room, px.SLOPES + row, i), score)
         out[px.SCORE, row] += simd_sum(score)
         for column in range(row + 1):
             square = counting() * 0.0
-            for i in range(0, cells.n_bins, SIMD_WIDTH):
+            for i in range(0, cells.facts.n_bins, SIMD_WIDTH):
                 here = simd_load(room, px.RATIO, i) * simd_load(room, px.SLOPES + row, i)
                 other = simd_load(room, px.PER_MASS, i) * simd_load(room, px.SLOPES + column, i)
                 square = fused(here, other, square)
             both = simd_sum(square)
             out[px.DAMPING + row, column] += both
             out[px.INFORMATION + row, column] += both
-    if cells.outlier_share > 0.0:
-        for i in range(cells.n_bins):
-            room[px.RATIO, i] *= 1.0 - cells.outlier_share
-    if cells.conditional:
+    if cells.law.outlier_share > 0.0:
+        for i in range(cells.facts.n_bins):
+            room[px.RATIO, i] *= 1.0 - cells.law.outlier_share
+    if cells.facts.conditional:
         loglik += _condition(cells, room, change, out)
     return loglik
 
 
 @kernel(inline=True, borrows=True)
-def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
+def _condition(cells: Sample, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Take off what all kept codes together give; return the change of the log-likelihood.
 
     With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean.
     """
     mass, slopes, ratios = room[px.MASS], room[px.SLOPES :], room[px.RATIO]
-    n, rest = cells.frames, 1.0 - cells.outlier_share
+    n, rest = cells.facts.n_frames, 1.0 - cells.law.outlier_share
     inside = 0.0
     for i in range(px.N_BLOCK):
         change[i] = 0.0
-    for cell in range(cells.n_bins):
+    for cell in range(cells.facts.n_bins):
         inside += cells.bins[px.KEPT, cell] * mass[cell]
         for i in range(px.N_BLOCK):
             change[i] += cells.bins[px.KEPT, cell] * slopes[i, cell]
@@ -528,14 +447,14 @@ def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArr
             out[px.DAMPING + i, j] += shared
     for i in range(px.N_BLOCK):
         out[px.SCORE, i] -= n * change[i]
-    for cell in range(cells.n_bins):
+    for cell in range(cells.facts.n_bins):
         ratios[cell] -= cells.bins[px.KEPT, cell] * n / inside * rest
-    return -n * math.log(inside)
+    return float(-n * math.log(inside))
 
 
 @kernel(inline=True, borrows=True)
 def _hermite_sums(
-    cells: Cells, part: Component, room: FloatArray, edges: FloatArray, place: int
+    cells: Sample, part: Component, room: FloatArray, edges: FloatArray, place: int
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over cells of ratio times the difference of Phi, phi, z phi, He2 phi, He3 phi."""
     mean, inverse = part.mean, 1.0 / part.sd
@@ -562,7 +481,7 @@ def _hermite_sums(
 @kernel(inline=True, borrows=True)
 def _subtract_curvature(
     theta: FloatArray,
-    cells: Cells,
+    cells: Sample,
     reach: float,
     numbers: FloatArray,
     edges: FloatArray,
@@ -574,7 +493,7 @@ def _subtract_curvature(
     following = 0
     for row in range(numbers.shape[0]):
         k, p0, p1, p2 = numbers[row, 0], numbers[row, 1], numbers[row, 2], numbers[row, 3]
-        for peak in range(cells.n_peaks):
+        for peak in range(cells.facts.n_peaks):
             slope = cells.peaks[px.SHARE_SLOPE, peak]
             share = cells.peaks[px.SHARE, peak] + theta[_SATELLITE] * slope
             part = component(k, peak, theta, cells, reach)
@@ -610,15 +529,15 @@ def _subtract_curvature(
 
 
 @kernel(inline=True, borrows=True)
-def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
+def _expect(cells: Sample, room: FloatArray) -> None:
     """Fill the counts expected of the codes that are not set aside."""
     inside = 1.0
-    if cells.conditional:
+    if cells.facts.conditional:
         inside = 0.0
-        for i in range(cells.n_bins):
+        for i in range(cells.facts.n_bins):
             inside += cells.bins[px.KEPT, i] * room[px.MASS, i]
-    for i in range(cells.n_bins):
-        pixel.bins[j, px.EXPECTED, i] = cells.frames * cells.bins[px.KEPT, i] * room[px.MASS, i] / inside
+    for i in range(cells.facts.n_bins):
+        cells.bins[px.EXPECTED, i] = cells.facts.n_frames * cells.bins[px.KEPT, i] * room[px.MASS, i] / inside
 
 
 def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
@@ -636,9 +555,9 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
                 out[place, row, column] = 0.0
     for j in range(pixel.facts.shape[0]):
         place = min(j, n - 1)
-        own[_EXPOSURE] = theta[place] if pixel.facts[j, px.DARK] == 0.0 else _NO_ELECTRONS
-        own[_BIAS] = theta[n + px.BIAS] - pixel.facts[j, px.CENTRE]
-        cells, room = cells_of(pixel, j), scratch.cells[place]
+        own[_EXPOSURE] = theta[place] if not pixel.facts[j].dark else _NO_ELECTRONS
+        own[_BIAS] = theta[n + px.BIAS] - pixel.facts[j].centre
+        cells, room = sample_of(pixel, j), scratch.cells[place]
         count, reach = fill_far_enough(own, cells, what, scratch.numbers, scratch.edges, room)
         if what == px.LOGLIK_ALONE:
             loglik += _log_mass(cells, room)
@@ -646,8 +565,8 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
         loglik += _sum_up(cells, room, scratch.small[px.RIGHT], out[place])
         _subtract_curvature(own, cells, reach, scratch.numbers[:count], scratch.edges, room, out[place])
         if what == px.EXPECTATIONS:
-            _expect(pixel, j, cells, room)
-        if pixel.facts[j, px.DARK] > 0.0:
+            _expect(cells, room)
+        if pixel.facts[j].dark:
             out[place, px.SCORE, 0] = 0.0
             for i in range(px.N_BLOCK):
                 out[place, px.INFORMATION + i, 0] = out[place, px.DAMPING + i, 0] = 0.0

@@ -297,7 +297,7 @@ def _loglik_alone(
 
 @kernel(inline=True, borrows=True)
 def _finish(
-    facts: FloatArray,
+    facts: Any,
     log_exposure: float,
     a: float,
     bias: float,
@@ -309,15 +309,15 @@ def _finish(
 
     The complete-data score is ``(k - H, k e/s2, e/s2, e^2/2 s2 - 1/2)`` with ``k = (y - e)/a``.
     """
-    n = facts[px.N_FRAMES]
+    n = facts.n_frames
     score, sums = out[px.SCORE], out[px.SUMS]
     exposure = math.exp(log_exposure)
     t = a * inverse
-    mean = facts[px.MEAN] - bias
+    mean = facts.mean - bias
     sum_e, sum_ee, sum_ye = totals[_E], totals[_EE] + a * a * totals[_V11], totals[_YE]
     sum_k = (n * mean - sum_e) / a
     sum_ke = (sum_ye - sum_ee) / a
-    sum_kk = (n * (facts[px.VARIANCE] + mean * mean) - 2.0 * sum_ye + sum_ee) / (a * a)
+    sum_kk = (n * (facts.variance + mean * mean) - 2.0 * sum_ye + sum_ee) / (a * a)
     sums[px.SUM_K], sums[px.SUM_KK], sums[px.SUM_KE] = sum_k, sum_kk, sum_ke
     sums[px.SUM_E], sums[px.SUM_EE] = sum_e, sum_ee
     v11, v12, v22 = totals[_V11], totals[_V12], totals[_V22]
@@ -368,7 +368,7 @@ def _evaluate_sample(
     """Evaluate one sample with electrons at its (log H, 1/g, mu - centre, log sigma^2)."""
     facts, bins = pixel.facts[sample], pixel.bins[sample]
     log_exposure, a, origin, log_variance = own
-    n_bins, zero = int(facts[px.N_BINS]), origin - facts[px.FIRST]
+    n_bins, zero = facts.n_bins, origin - facts.first
     rows, coefficients = scratch.rows, scratch.coefficients
     exposure, inverse = math.exp(log_exposure), math.exp(-log_variance)
     j = max(0, math.floor(0.5 - zero / a))
@@ -397,7 +397,7 @@ def _evaluate_sample(
     else:
         sums_of_any(bins, comb, n_blocks, rows, coefficients)
     if what == px.EXPECTATIONS:
-        _loglik_alone(bins, comb, n_blocks, rows, coefficients, facts[px.N_FRAMES])
+        _loglik_alone(bins, comb, n_blocks, rows, coefficients, facts.n_frames)
     _finish(facts, log_exposure, a, origin, inverse, rows[_TOTALS], out)
     return float(rows[_TOTALS, _LOGLIK])
 
@@ -408,11 +408,11 @@ def _evaluate_dark(
 ) -> float:
     """Evaluate a sample without electrons, one Gaussian."""
     facts, inverse = pixel.facts[j], math.exp(-log_variance)
-    n, deviation = facts[px.N_FRAMES], facts[px.MEAN] - bias
+    n, deviation = facts.n_frames, facts.mean - bias
     for row in range(px.N_ROWS):
         for column in range(px.N_BLOCK):
             out[row, column] = 0.0
-    sum_e, sum_ee = n * deviation, n * (facts[px.VARIANCE] + deviation * deviation)
+    sum_e, sum_ee = n * deviation, n * (facts.variance + deviation * deviation)
     out[px.SUMS, px.SUM_E], out[px.SUMS, px.SUM_EE] = sum_e, sum_ee
     out[px.SCORE, 2] = sum_e * inverse
     out[px.SCORE, 3] = 0.5 * (sum_ee * inverse - n)
@@ -422,8 +422,8 @@ def _evaluate_dark(
             out[px.INFORMATION + row, column] = out[px.DAMPING + row, column]
     if expect:
         sd = math.exp(0.5 * log_variance)
-        for i in range(int(facts[px.N_BINS])):
-            z = (facts[px.FIRST] + i - bias) / sd
+        for i in range(facts.n_bins):
+            z = (facts.first + i - bias) / sd
             pixel.bins[j, px.EXPECTED, i] = n * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
     loglik: float = -0.5 * (n * (LOG_2PI + log_variance) + sum_ee * inverse)
     return loglik
@@ -443,8 +443,8 @@ def evaluate_density(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratc
     a, bias, log_variance = theta[n + px.STEP], theta[n + px.BIAS], theta[n + px.LOG_VARIANCE]
     loglik = 0.0
     for j in range(n):
-        own_bias = bias - pixel.facts[j, px.CENTRE]
-        if pixel.facts[j, px.DARK] > 0.0:
+        own_bias = bias - pixel.facts[j].centre
+        if pixel.facts[j].dark:
             loglik += _evaluate_dark(pixel, j, own_bias, log_variance, what == px.EXPECTATIONS, out[j])
         else:
             own = theta[j], a, own_bias, log_variance

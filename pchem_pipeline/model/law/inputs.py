@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
+from pchem_pipeline.model.law.pixel_numba import LAW
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
 _LAWS: dict[CountLaw, int] = {
@@ -29,14 +31,14 @@ def pack(models: Sequence[SampleLaw], n: int) -> Law:
         ValueError: if an array has neither 1 nor n rows, or the weights of a mixture do not sum to 1.
     """
     parts = [_pack_one(model, n) for model in models]
-    numbers, own, peaks, exposures, added, edges = (_stacked(each) for each in zip(*parts, strict=True))
-    n_peaks = np.array([part[2].shape[2] for part in parts], np.int64)
+    numbers, peaks, exposures, added, edges = (_stacked(each) for each in zip(*parts, strict=True))
+    n_peaks = np.array([part[1].shape[2] for part in parts], np.int64)
     pattern = np.array(models[0].free_satellite_pattern, np.float64).reshape(-1, 2)
-    return Law(numbers, own, peaks, n_peaks, exposures, added, edges, pattern)
+    return Law(numbers, peaks, n_peaks, exposures, added, edges, pattern)
 
 
-def _pack_one(model: SampleLaw, n: int) -> tuple[FloatArray, ...]:
-    """Return numbers, own levels, peaks, exposures, added exposures and edges, of one row or n, see `Law`."""
+def _pack_one(model: SampleLaw, n: int) -> tuple[NDArray[Any], ...]:
+    """Return numbers, peaks, exposures, added exposures and edges, of one row or n, see `Law`."""
 
     def per_pixel(*names: str) -> FloatArray:
         values = [np.asarray(getattr(model, name), np.float64) for name in names]
@@ -65,11 +67,14 @@ def _pack_one(model: SampleLaw, n: int) -> tuple[FloatArray, ...]:
         model.outlier_share,
         model.outlier_share / model.outlier_codes,
         model.edge_first,
+        *per_pixel("level_scale", "level_shift_e", "extra_variance_e2", "extra_variance_dn2").T,
     )
-    rows = [np.atleast_1d(np.asarray(each, np.float64)) for each in numbers]
-    own = per_pixel("level_scale", "level_shift_e", "extra_variance_e2", "extra_variance_dn2")
+    rows = np.broadcast_arrays(*[np.atleast_1d(np.asarray(each, np.float64)) for each in numbers])
+    packed = np.zeros((rows[0].size, 1), LAW)
+    for name, row in zip(LAW.names or (), rows, strict=True):
+        packed[name] = row[:, None]
     edges = np.atleast_2d(np.asarray(model.edge_shift, np.float64))
-    return np.stack(np.broadcast_arrays(*rows), axis=1), own, peaks, exposures, added, edges
+    return packed, peaks, exposures, added, edges
 
 
 def _limit(value: float | FloatArray | None, none: float) -> FloatArray | float:
@@ -77,10 +82,10 @@ def _limit(value: float | FloatArray | None, none: float) -> FloatArray | float:
     return none if value is None else np.where(np.isnan(value), none, value)
 
 
-def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
+def _stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Return arrays of the samples in one, as large as the largest, 0 in columns beyond."""
     most = np.max([part.shape for part in parts], axis=0)
-    found = np.zeros((len(parts), *most))
+    found = np.zeros((len(parts), *most), parts[0].dtype)
     for own, part in zip(found, parts, strict=True):
         own[..., : part.shape[-1]] = part  # one row is of all pixels
     return found

@@ -21,18 +21,9 @@ from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
 from pchem_pipeline.model.law import pixel_numba as px
-from pchem_pipeline.model.law.cells_numba import (
-    Cells,
-    Component,
-    Law,
-    cell_of,
-    cells_of,
-    component,
-    fill_masses,
-    resolve,
-)
+from pchem_pipeline.model.law.cells_numba import Component, Law, cell_of, component, fill_masses, resolve
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch, make_pixel, make_scratch
+from pchem_pipeline.model.law.pixel_numba import Pixel, Sample, Scratch, make_pixel, make_scratch, sample_of
 
 _TOP_REACH = 12.0
 _SEEN = 7.5  # standard deviations within which samples are seen
@@ -57,8 +48,8 @@ def place_codes(
     whole = math.floor(value + 0.5)
     codes = Codes(value - whole, parts, n)
     n_whole = math.floor(codes.first + (n - 1) / parts + 0.5) + 1
-    pixel.facts[0, px.N_BINS], pixel.facts[0, px.FIRST] = float(n_whole), 0.0
-    found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, whole, 0.0)
+    pixel.facts[0].n_bins, pixel.facts[0].first = n_whole, 0.0
+    found = Pixel(pixel.bins, pixel.facts, pixel.laws, pixel.peaks, pixel.mixtures, whole, 0.0)
     resolve(law, index, satellites[index, 0], found)
     return found, codes
 
@@ -70,34 +61,34 @@ def share_scratch(n_codes: int) -> FloatArray:
 
 
 @kernel(borrows=True)
-def number_mass(k: int, exposure: float, cells: Cells) -> float:
+def number_mass(k: int, exposure: float, cells: Sample) -> float:
     """Return P(k; H) of a pixel; H may be 0."""
     mass: float = electron_number(
-        cells.count_law, cells.dispersion, k, max(exposure, SMALLEST_MASS), cells.mixtures
+        cells.law.count_law, cells.law.dispersion, k, max(exposure, SMALLEST_MASS), cells.mixtures
     )[0]
     return mass
 
 
 @kernel(borrows=True)
-def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes, reach: float) -> tuple[int, int, float]:
+def _span(k: int, theta: FloatArray, cells: Sample, codes: Codes, reach: float) -> tuple[int, int, float]:
     """Return the codes that an electron number reaches, ends excluded, and how far up it lies at least."""
     low, high = codes.n, 0
     nearest = math.inf
-    for peak in range(cells.n_peaks):
+    for peak in range(cells.facts.n_peaks):
         if cells.peaks[px.SHARE, peak] == 0.0 and cells.peaks[px.SHARE_SLOPE, peak] == 0.0:
             continue
         part = component(float(k), peak, theta, cells, REACH)
-        width = min(FARTHEST, max(reach, theta[1] / part.sd)) * part.sd + 0.5 + cells.margin
+        width = min(FARTHEST, max(reach, theta[1] / part.sd)) * part.sd + 0.5 + cells.facts.margin
         bottom, top = part.mean - width - codes.first, part.mean + width - codes.first
         nearest = min(nearest, bottom + codes.first)
         low = min(low, int(min(max(math.ceil(bottom * codes.parts), 0.0), float(codes.n))))
         high = max(high, int(min(max(math.floor(top * codes.parts) + 1.0, 0.0), float(codes.n))))
     # beyond the limits of the ADC all is counted at the limit
-    if cells.bottom >= 0:
-        high = max(high, min(codes.n, (cells.bottom + 1) * codes.parts))
+    if cells.facts.bottom >= 0:
+        high = max(high, min(codes.n, (cells.facts.bottom + 1) * codes.parts))
         low = 0 if high > 0 and nearest < codes.first else low
-    if cells.top <= cells.n_bins:
-        low = max(0, min(low, (cells.top - 1) * codes.parts - codes.parts // 2))
+    if cells.facts.top <= cells.facts.n_bins:
+        low = max(0, min(low, (cells.facts.top - 1) * codes.parts - codes.parts // 2))
         high = codes.n
     return low, high, nearest
 
@@ -105,7 +96,7 @@ def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes, reach: float) -
 @kernel(borrows=True)
 def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, law: Law) -> tuple[int, int]:
     """Return the first and last whole code that samples of a pixel show, after its centre."""
-    cells = cells_of(pixel, 0)
+    cells = sample_of(pixel, 0)
     factor = added = 0.0
     for i in range(cells.mixtures.shape[1]):
         factor = max(factor, cells.mixtures[px.EXPOSURE_FACTOR, i])
@@ -120,19 +111,18 @@ def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, l
         seen = number_mass(k, exposure, cells) > _LEAST_MASS
         if not seen and k > exposure * factor + added:
             break
-        for peak in range(cells.n_peaks if seen else 0):
+        for peak in range(cells.facts.n_peaks if seen else 0):
             part = component(float(k), peak, theta, cells, REACH)
             reach = _SEEN * part.sd + margin
             low, high = min(low, part.mean - reach), max(high, part.mean + reach)
         k += 1
-    facts = pixel.facts[0]
-    bottom, top = facts[px.CLIP_LOW] - pixel.centre, facts[px.CLIP_HIGH] - pixel.centre
+    bottom, top = cells.law.clip_low - pixel.centre, cells.law.clip_high - pixel.centre
     low, high = min(max(low, bottom), top), max(min(high, top), bottom)
     return math.floor(low), math.ceil(high)
 
 
 @kernel(borrows=True)
-def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
+def _add_whole(cells: Sample, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
     """Add the mass of whole codes to the first row of ``share``; the second gets the tails at their edges."""
     mean, inverse = part.mean, 1.0 / part.sd
     for i in range(low, high + 1, SIMD_WIDTH):
@@ -147,10 +137,10 @@ def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int
 
 
 @kernel(borrows=True)
-def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, int]:
+def number_range(theta: FloatArray, cells: Sample, codes: Codes) -> tuple[int, int]:
     """Return the first electron number that reaches the codes, and the one after the last."""
     last = codes.first + (codes.n - 1) / codes.parts
-    to_top = cells.top <= cells.n_bins
+    to_top = cells.facts.top <= cells.facts.n_bins
     most = max((last - theta[2]) / theta[1], 0.0)
     most = most + _TOP_REACH * math.sqrt(most + 1.0) + _TOP_REACH
     first, end = -1, 0
@@ -168,7 +158,7 @@ def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, in
 
 @kernel(borrows=True)
 def fill_level(
-    k: int, likely: float, theta: FloatArray, cells: Cells, codes: Codes, share: FloatArray
+    k: int, likely: float, theta: FloatArray, cells: Sample, codes: Codes, share: FloatArray
 ) -> tuple[int, int]:
     """Fill P(code | k) of the codes that an electron number reaches; return these, the end excluded.
 
@@ -178,7 +168,7 @@ def fill_level(
     low, high, _ = _span(k, theta, cells, codes, reach_of(math.log(likely)))
     for i in range(high - low):
         share[0, i] = 0.0
-    for peak in range(cells.n_peaks if low < high else 0):
+    for peak in range(cells.facts.n_peaks if low < high else 0):
         weight = cells.peaks[px.SHARE, peak] + theta[4] * cells.peaks[px.SHARE_SLOPE, peak]
         if weight == 0.0:
             continue
@@ -255,13 +245,13 @@ def mass_tile(
     n_codes = out.shape[1]
     room, scratch = pixel_scratch(n_codes, law)
     theta, what = scratch.small[px.OWN], px.DERIVATIVES if slopes.shape[0] > 0 else px.LOGLIK_ALONE
-    room.facts[0, px.N_BINS], room.facts[0, px.FIRST] = float(n_codes), 0.0
+    room.facts[0].n_bins, room.facts[0].first = n_codes, 0.0
     for index in range(parameters.shape[0]):
         if not known_theta(parameters[index], first[index], satellites[index, 1], theta):
             continue
-        pixel = Pixel(room.bins, room.facts, room.peaks, room.mixtures, first[index], 0.0)
+        pixel = Pixel(room.bins, room.facts, room.laws, room.peaks, room.mixtures, first[index], 0.0)
         resolve(law, index, satellites[index, 0], pixel)
-        cells = cells_of(pixel, 0)
+        cells = sample_of(pixel, 0)
         fill_masses(theta, cells, stage, what, scratch.numbers, scratch.edges, scratch.cells[0])
         for i in range(n_codes):
             out[index, i] = scratch.cells[0, px.MASS, i]

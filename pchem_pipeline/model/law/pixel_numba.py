@@ -11,7 +11,7 @@ An evaluation is one array of shape (J, N_ROWS, N_BLOCK): see the names of its r
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,30 +40,45 @@ LOGLIK_ALONE, DERIVATIVES, EXPECTATIONS = range(3)
 WEIGHT, CUMULATIVE, EXPECTED, EDGE, KEPT = range(5)
 N_BIN_ROWS = 5
 
-# columns of `Pixel.facts`: the histogram ...
-DARK, N_BINS, FIRST, N_FRAMES, MEAN, VARIANCE, CENTRE, OCCUPIED, CONDITIONAL = range(9)
-# ... and its law, see `Cells`
-(
-    COUNT_LAW,
-    DISPERSION,
-    CURVATURE,
-    PER_ELECTRON,
-    PER_ELECTRON2,
-    CLIP_LOW,
-    CLIP_HIGH,
-    OUTLIER_SHARE,
-    OUTLIER_MASS,
-    EDGE_FIRST,
-    LEVEL_SCALE,
-    LEVEL_SHIFT,
-    EXTRA_E2,
-    EXTRA_DN2,
-    BOTTOM,
-    TOP,
-    MARGIN,
-    N_PEAKS,
-) = range(9, 27)
-N_FACTS = 27
+#: What is known of a sample's histogram, and of its cells under the law.
+FACTS = np.dtype(
+    [
+        ("dark", "?"),  # it holds no electrons
+        ("n_bins", "i8"),  # DN in use
+        ("first", "f8"),  # first DN less the centre
+        ("n_frames", "f8"),
+        ("mean", "f8"),  # less the centre, DN
+        ("variance", "f8"),  # DN^2
+        ("centre", "f8"),  # DN near the mean that the others are counted from, less that of the pixel
+        ("occupied", "i8"),  # DN with samples
+        ("conditional", "?"),  # codes are set aside
+        ("bottom", "i8"),  # last edge at minus infinity, -1 without one
+        ("top", "i8"),  # first edge at infinity, n_bins + 1 without one
+        ("margin", "f8"),  # largest distance of a finite edge from its place half a DN below its code, DN
+        ("n_peaks", "i8"),  # levels of the noise
+    ],
+    align=True,
+)
+#: The numbers of a law, see :class:`~pchem_pipeline.model.law.sample_law.SampleLaw`.
+LAW = np.dtype(
+    [
+        ("count_law", "i8"),
+        ("dispersion", "f8"),
+        ("curvature", "f8"),
+        ("per_electron", "f8"),  # variance, e-^2
+        ("per_electron2", "f8"),
+        ("clip_low", "f8"),
+        ("clip_high", "f8"),
+        ("outlier_share", "f8"),
+        ("outlier_mass", "f8"),  # in each code
+        ("edge_first", "i8"),
+        ("level_scale", "f8"),
+        ("level_shift", "f8"),  # e-
+        ("extra_e2", "f8"),
+        ("extra_dn2", "f8"),
+    ],
+    align=True,
+)
 
 # rows of `Pixel.peaks`: levels of the noise beside the comb's own
 SHARE, SHARE_SLOPE, SHIFT_E, SHIFT_DN, SHIFT_SIGMA, WIDTH = range(6)
@@ -100,18 +115,6 @@ TAIL, DENSITY, Z_DENSITY = range(3)
 EDGES_KEPT = 8192
 
 
-class Histogram(NamedTuple):
-    """One sample's histogram without its empty ends, values counted from a centre near its mean."""
-
-    weights: FloatArray  # counts of successive DN, at least ``n_bins`` long
-    cumulative: FloatArray  # ``cumulative[i]`` is the sum of the first i weights
-    n_bins: int  # number of DN in use
-    first: float  # first DN minus the centre
-    n: float  # number of frames
-    mean: float  # mean minus the centre, DN
-    variance: float  # variance, DN^2
-
-
 class Pixel(NamedTuple):
     """The histograms of one pixel and what the law says of this pixel.
 
@@ -119,7 +122,8 @@ class Pixel(NamedTuple):
         bins: by sample: counts, their sums before each DN, the counts expected (out of an evaluation), lower
             edges of the cells, 1 for codes that are not set aside; shape (J, N_BIN_ROWS, bins + 1 +
             SIMD_WIDTH).
-        facts: numbers of each sample, shape (J, N_FACTS).
+        facts: of each sample, see `FACTS`, shape (J,).
+        laws: of each sample, see `LAW`, shape (J,).
         peaks: satellite peaks of each sample, shape (J, N_PEAK_ROWS, enough); weight 0 where there are fewer.
         mixtures: of exposures, shape (J, N_MIXTURE_ROWS, enough); weight 0 where there are fewer.
         centre: DN that all is counted from.
@@ -127,11 +131,22 @@ class Pixel(NamedTuple):
     """
 
     bins: FloatArray
-    facts: FloatArray
+    facts: NDArray[np.void]
+    laws: NDArray[np.void]
     peaks: FloatArray
     mixtures: FloatArray
     centre: int
     longest_step: float
+
+
+class Sample(NamedTuple):
+    """One of the samples of a pixel, see `Pixel`."""
+
+    bins: FloatArray
+    facts: Any
+    law: Any
+    peaks: FloatArray
+    mixtures: FloatArray
 
 
 class Scratch(NamedTuple):
@@ -195,12 +210,13 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
 def make_pixel(dark: BoolArray, n_bins: int, n_peaks: int, n_exposures: int) -> Pixel:
     """Return room for histograms, levels of the noise and a mixture of exposures, of so many at most."""
     n = dark.size
-    facts = np.zeros((n, N_FACTS))
+    facts = np.zeros(n, FACTS)
     for j in range(n):
-        facts[j, DARK] = 1.0 if dark[j] else 0.0
+        facts[j].dark = dark[j]
     return Pixel(
         np.zeros((n, N_BIN_ROWS, n_bins + 1 + SIMD_WIDTH)),
         facts,
+        np.zeros(n, LAW),
         np.zeros((n, N_PEAK_ROWS, n_peaks)),
         np.zeros((n, N_MIXTURE_ROWS, n_exposures)),
         0,
@@ -225,8 +241,8 @@ def copy_evaluation(source: FloatArray, target: FloatArray) -> None:
 
 
 @kernel(borrows=True)
-def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray, facts: FloatArray) -> int:
-    """Fill the histogram of one sample without its empty ends, and its facts but for ``CENTRE``; return that.
+def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray, facts: Any) -> int:
+    """Fill the histogram of one sample without its empty ends, and its facts but for the centre; return that.
 
     The mask is that of :data:`COUNTED`; the centre is counted in bins after bin 0.
     """
@@ -259,30 +275,20 @@ def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray,
     for i in range(n_bins, n_bins + SIMD_WIDTH):
         weights[i] = kept[i] = 0.0
     n = cumulative[n_bins]
-    facts[N_BINS], facts[N_FRAMES], facts[OCCUPIED] = float(n_bins), n, float(occupied)
-    facts[CONDITIONAL] = 1.0 if aside else 0.0
+    facts.n_bins, facts.n_frames, facts.occupied, facts.conditional = n_bins, n, occupied, aside
     if n == 0.0:
-        facts[N_BINS] = facts[FIRST] = facts[MEAN] = facts[VARIANCE] = 0.0
+        facts.n_bins, facts.first, facts.mean, facts.variance = 0, 0.0, 0.0, 0.0
         return 0
     mean = moment / n
     square = 0.0
     for i in range(n_bins):
         square += weights[i] * (i - mean) ** 2
     middle = math.floor(mean)
-    facts[FIRST], facts[MEAN], facts[VARIANCE] = -float(middle), mean - middle, square / n
+    facts.first, facts.mean, facts.variance = -float(middle), mean - middle, square / n
     return int(low + middle)
 
 
 @kernel(views=True)
-def histogram_of(pixel: Pixel, j: int) -> Histogram:
-    """Return one sample's histogram, counted from its own centre."""
-    facts = pixel.facts[j]
-    return Histogram(
-        pixel.bins[j, WEIGHT],
-        pixel.bins[j, CUMULATIVE],
-        int(facts[N_BINS]),
-        facts[FIRST],
-        facts[N_FRAMES],
-        facts[MEAN],
-        facts[VARIANCE],
-    )
+def sample_of(pixel: Pixel, j: int) -> Sample:
+    """Return one sample."""
+    return Sample(pixel.bins[j], pixel.facts[j], pixel.laws[j], pixel.peaks[j], pixel.mixtures[j])
