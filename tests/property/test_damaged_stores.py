@@ -180,7 +180,7 @@ def test_without_the_model_of_the_fit_nothing_is_expected_of_a_pixel(finished, c
     same(numbers(copy / "run.zarr"), numbers(finished / "run.zarr"))
 
 
-def test_pixels_of_a_tile_that_failed_have_no_value(copy, monkeypatch):
+def test_pixels_of_a_tile_that_failed_have_no_value(copy, monkeypatch, capsys):
     do_tile = maps._do_tile
 
     def failing(tile, store, **more):
@@ -190,6 +190,7 @@ def test_pixels_of_a_tile_that_failed_have_no_value(copy, monkeypatch):
 
     monkeypatch.setattr(maps, "_do_tile", failing)
     assert "maps: 1 of 2 units failed" in asked(run, copy / "run.yaml", ["maps"], force=True)
+    assert "odd" not in capsys.readouterr().err  # the error says it
     found = open_run(copy / "run.zarr")
     assert found.maps.quality.values[:, 8:].tolist() == [[NO_VALUE] * 8] * 8
     assert not found.usable[:, 8:].any()
