@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2022: of a simulated stack, and of its samples with all that is looked at; of
-# a code in an evaluation of the likelihood by a plain fit, and in one with effects by components of the law
-_STACK, _SAMPLE, _CODE, _REFIT = 0.2, 6.5e-8, 1.0e-8, 1.4e-8
+# a code in an evaluation of the likelihood by a plain fit, and in one with effects, by components of the law
+# and one more
+_STACK, _SAMPLE, _CODE, _WITH_EFFECTS = 0.2, 6.5e-8, 1.0e-8, 2.0e-8
 # of what is learnt of the sensor from a pixel, and the same by components
 _LEARN, _LEARN_BY = 4.0e-4, 1.0e-4
 MOST_LEARNT_FROM = 1000  # pixels
@@ -68,9 +69,9 @@ class Effort:
         """Count a simulated stack whose plain fits evaluated so many codes, see `Evidence.evaluated`."""
         self.spent += _STACK + _SAMPLE * samples + _CODE * evaluated
 
-    def refit(self, evaluated: float, components: int, tags: Iterable[str]) -> None:
-        """Count fits with effects that evaluated so many codes, see `FitResult.evaluated`."""
-        self.spent += _REFIT * evaluated * components
+    def evaluate(self, codes: float, components: int, tags: Iterable[str]) -> None:
+        """Count evaluations of the likelihood with effects, at so many codes, by components of the law."""
+        self.spent += _WITH_EFFECTS * codes * (1 + components)
         self.tried |= set(tags)
 
     def learn(self, pixels: int, components: int) -> None:
@@ -80,11 +81,6 @@ class Effort:
     def ask(self, samples: int) -> None:
         """Count a look at samples for guesses of all effects, or for what none of them explains."""
         self.spent += _ASKED * samples
-
-    def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:
-        """Count the masses of so many codes under effects, whose law has so many components."""
-        self.spent += _REFIT * masses * (1 + components)
-        self.tried |= set(tags)
 
     def check(self, doing: str) -> None:
         """Raise an error if there is nothing left for what comes next."""

@@ -343,10 +343,10 @@ def _first_of_each(readers: Sequence[FrameReader], values: Sequence[Any], what: 
     """Return the first values that differ, each with its files, of many the first and their number."""
     seen: dict[Any, list[str]] = {}
     paths = [reader.paths[0] for reader in readers]
-    alike = len({path.name for path in paths}) < len(paths)
+    repeated = len({path.name for path in paths}) < len(paths)
     for path, value in zip(paths, values, strict=True):
         if value is not None:
-            seen.setdefault(value, []).append(f"{path.parent.name}/{path.name}" if alike else path.name)
+            seen.setdefault(value, []).append(f"{path.parent.name}/{path.name}" if repeated else path.name)
     return ", ".join(
         f"{what}{value} in {' and '.join(files if len(files) < 5 else (files[0], f'{len(files) - 1} more'))}"
         for value, files in [*seen.items()][:4]

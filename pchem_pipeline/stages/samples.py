@@ -164,8 +164,9 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
     exposed = np.flatnonzero(np.isfinite(x)).tolist()
     if settings.against == "integration_time" and len({exposures[i].kind == "dark" for i in exposed}) > 1:
         raise ConfigError(
-            "input.samples: some are dark and some are not, so H has no slope against time; give the levels "
-            "of the lamp (pchem joint RUNS --level 0,1) or fit without a slope (--against none)"
+            "input.samples: some are dark and some are not (input.kind of the runs), so H does not grow with "
+            "time alone; give the levels of the lamp (pchem joint RUNS --level 0,1) or fit without a slope "
+            "(--against none)"
         )
     for last, i in itertools.pairwise(exposed):
         if x[i] <= x[last]:

@@ -118,7 +118,7 @@ class FrameView:
         """Number of frames."""
         return int(self.numbers.size)
 
-    @property
+    @cached_property
     def rows(self) -> FloatArray:
         """The sums :data:`OF_LINES` of each row, (3, n, y)."""
         return np.concatenate([self.halves.sum(axis=1), self.noise[None]])

@@ -435,17 +435,17 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         default=1, ge=1, le=4096, description="column blocks read in parallel, with independent noise"
     )
     rows: Count | None = Field(
-        default=None, ge=1, description="rows of a frame, of which these may be a part; null: these are all"
+        default=None, ge=1, description="rows of the sensor where the frames have a part of them; null: all"
     )
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with as many taps as these columns have of its width, in frames of all rows."""
+        """Return it with as many taps as these columns have of its width, as a part of all rows."""
         taps = self._with_taps((columns[1] - columns[0]) / shape[1])
         return taps.model_copy(update={"rows": self.rows or shape[0]})
 
     def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with taps of the same width on all columns; one tap is one whatever the window."""
-        whole = self.model_copy(update={"rows": None})
+        whole = self.model_copy(update={"rows": None if self.rows == shape[0] else self.rows})
         return whole if self.taps == 1 else whole._with_taps(shape[1] / (columns[1] - columns[0]))
 
     def _with_taps(self, factor: float) -> Self:
@@ -460,7 +460,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         width = -(-columns // taps)
         amplitudes = pink_amplitudes(rows * width, _RECORD)
         noise = np.empty((context.frames.size, context.rows.size, columns))
-        # waves longer than these rows, one by one: cycles per frame, and shares of the variance
+        # waves longer than these rows, one by one: cycles over all rows, and shares of the variance
         whole = max(self.rows or rows, rows)
         cycles = np.arange(_RECORD, _RECORD * whole // rows) / _RECORD
         shares = 1.0 / (cycles * (0.5 + _RECORD * math.log(max(whole * width / 2.0, 1.0))))

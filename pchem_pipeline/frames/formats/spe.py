@@ -56,7 +56,8 @@ class SpeReader(ContiguousReader):
         field = {name: struct.unpack_from(kind, head, place)[0] for name, (place, kind) in _FIELDS.items()}
         if field["samples"] not in _SAMPLES:
             raise InputError(
-                f"{path}: samples of type {field['samples']}; record whole numbers (16 or 32 bits)"
+                f"{path}: samples of type {field['samples']}; record whole numbers (16 or 32 bits), or "
+                "correct the name if this is no SPE file"
             )
         stored = np.dtype(_SAMPLES[field["samples"]])
         n, rows, columns, regions = (field[name] for name in ("frames", "rows", "columns", "regions"))

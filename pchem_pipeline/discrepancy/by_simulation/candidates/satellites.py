@@ -77,7 +77,7 @@ def with_satellites(
         fit = fits.get(law.free_satellite_pattern)
         if fit is None:
             fit = fit_histograms(counts[some], origin[some], law=law.of(some), start=start[some])
-            effort.refit(fit.evaluated(counts[some]), law.components, ())
+            effort.evaluate(fit.evaluated(counts[some]), law.components, ())
             fits[law.free_satellite_pattern] = fit
         has = fit.satellite_weight > 0.0
         if has.any():

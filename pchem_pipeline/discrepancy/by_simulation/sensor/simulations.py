@@ -75,7 +75,7 @@ class Simulations:
         steady = [e for e in own if not e.resample_pixels]
         added = added_exposures(steady, frames, numbers, plain.maps)
         fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
-        self.effort.refit(fit.evaluated, fit.components, (effect.tag for effect in model))
+        self.effort.evaluate(fit.evaluated, fit.components, (effect.tag for effect in model))
         return fit
 
     def expected(self, model: tuple[Effect, ...], evidence: Evidence, numbers: IntArray) -> FloatArray | None:
