@@ -317,8 +317,10 @@ _WHERE, _SIZE, _FULL, _EMPTY = OF_PIXEL
 _LOGNORMAL = 0.4
 # standard deviations of the logarithms of its times by which hardly a trap is slower
 _FARTHEST = 4.0
-# amplitudes tried in every pixel, in units of that of the effect
-_EQUAL, _EXPONENTIAL = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0), (0.35, 0.5, 0.7, 1.0, 1.35, 1.8, 2.5, 3.4)
+# steps tried in every pixel: around that of all, or 0.35 to 7 e-, of which a fit refines the best one
+_EQUAL = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
+_SPREAD_E = tuple(0.35 * 1.35**i for i in range(11))
+_FAST = 0.1  # correlation time, frames, of a trap whose state is drawn anew in every frame
 #: Largest scatter of the logarithms of steps that are distributed so.
 _SPREADS = {"equal": 0.2, "lognormal": 0.6}
 _ALARM = 0.1  # pixels wrongly given levels, of those that have some
@@ -373,8 +375,8 @@ class RtsNoise(Effect, tag="rts_noise"):
     )
     spread: Literal["equal", "lognormal", "exponential"] = Field(
         default="equal",
-        description="equal: the same step in all these pixels; lognormal: step_e is the median, "
-        "standard deviation of the logarithm 0.4; exponential: step_e is the mean",
+        description="equal: the same step in all these pixels; lognormal: amplitude_e is the median, "
+        "standard deviation of the logarithm 0.4; exponential: the mean",
     )
     probability: Ratio = Field(
         default=0.2,
@@ -456,12 +458,10 @@ class RtsNoise(Effect, tag="rts_noise"):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return what is typical, in as many pixels as stand out: slow traps by what they do in time."""
-        slow = cls.typical_as_seen(evidence, "time.block.readout.cnt")
-        return [
-            *(one for one in super().estimate(evidence) if one.sampling == "correlated"),
-            *(one for one in slow if one.sampling == "single"),
-        ]
+        """Return what is typical, in as many pixels as stand out, and traps faster than the frames."""
+        levels = cls.typical_as_seen(evidence, *cls.signature[:2], "time.block.readout.cnt")
+        single = [one for one in levels if one.sampling == "single"]
+        return [*levels, *(one.model_copy(update={"correlation_frames": _FAST}) for one in single[:1])]
 
     def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
         """Return it with the steps of these traps, as often full, in such a share of the pixels."""
@@ -481,11 +481,11 @@ class RtsNoise(Effect, tag="rts_noise"):
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that looks for such levels in every pixel, with a weight of its own.
 
-        The fit decides pixel by pixel, since the effect is in few of them; steps around the stated one are
-        tried, more of them where they are spread.
+        The fit decides pixel by pixel, since the effect is in few of them. Steps that differ from pixel to
+        pixel do so tenfold: they are sought whatever the stated one is.
         """
-        factors = _EQUAL if self.spread == "equal" else _EXPONENTIAL
-        steps = [f * self.amplitude_e for f in factors if self.amplitude_e > 0]
+        steps = [f * self.amplitude_e for f in _EQUAL] if self.spread == "equal" else _SPREAD_E
+        steps = steps if self.amplitude_e > 0 else ()
         alarm = min(max(_ALARM * self.fraction, 1e-5), 1e-3)
         return model.with_free_satellites(steps, pattern=self._pattern(), alarm=alarm)
 

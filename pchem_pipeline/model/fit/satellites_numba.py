@@ -37,7 +37,7 @@ _LEAST_WEIGHT, _MOST_WEIGHT = 0.02, 0.6  # of the satellites there
 _LEAST_SKEWNESS = 0.15
 _SHORTFALL = 0.25  # of the electrons, by which their variance may exceed that of the histogram
 _N_ATTEMPTS = 4  # from the fit, one electron more and less, another comb
-_FINER, _N_REFINED = 0.12, 4  # first step of log amplitude, and steps at most
+_FINER, _N_REFINED = 0.12, 12  # first step of log amplitude, and steps at most: a range of 4
 _LEAST_START, _MOST_START = 0.005, 0.5  # weight of the satellites at a start
 
 

@@ -1,11 +1,15 @@
 """Noise of single pixels: the moments and levels of its forward models, and the law of a pixel."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.analog_signal import analog, within
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.noise import FlickerNoise, RtsNoise
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
@@ -102,6 +106,25 @@ def test_telegraph_noise_leaves_the_levels_to_the_pixels():
     model = RtsNoise(fraction=0.01, amplitude_e=1.5, samples=2).sample_law(SampleLaw(), MAPS)
     assert 1.5 in model.free_satellites
     assert dict(model.free_satellite_pattern) == pytest.approx({-0.5: 1 / 3, 0.5: 1 / 3, -1: 1 / 6, 1: 1 / 6})
-    spread = RtsNoise(fraction=0.01, amplitude_e=1.5, spread="exponential").sample_law(SampleLaw(), MAPS)
-    assert min(spread.free_satellites) < min(model.free_satellites)
     assert RtsNoise(fraction=0.01, amplitude_e=0.0).sample_law(SampleLaw(), MAPS).free_satellites == ()
+
+
+@pytest.mark.parametrize("step", [1.5, 3.0, 4.4])
+def test_the_step_of_a_trap_is_measured_however_far_it_is_from_the_stated_one(step):
+    rng, shape = np.random.default_rng(1), (4000, 20)
+    signal = rng.poisson(1.0, shape) + step * (rng.random(shape) < 0.3) + 0.25 * rng.standard_normal(shape)
+    histograms = histogram_frames(np.rint(100.0 + 9.0 * signal).astype(np.uint16)[:, None])
+    noise = RtsNoise(fraction=0.01, amplitude_e=1.0, sampling="single", spread="exponential")
+    law = noise.sample_law(SampleLaw(), MAPS)
+    fit = fit_histograms(histograms.counts[0], histograms.origin[0], law=law)
+    assert np.median(fit.satellite_amplitude_e) == pytest.approx(step, rel=0.01)
+    assert np.mean(np.abs(fit.satellite_amplitude_e / step - 1.0) < 0.1) >= 0.9
+    assert np.median(fit.satellite_weight) == pytest.approx(0.3, abs=0.01)
+
+
+def test_fast_traps_are_guessed_too_since_a_histogram_does_not_tell_how_long_a_trap_stays():
+    seen = SimpleNamespace(z={"shape.He4.chi": 20.0}, n_frames=4000, maps=MAPS)
+    times = {one.correlation_frames for one in RtsNoise.estimate(seen) if one.sampling == "single"}
+    assert min(times) < 0.2
+    assert max(times) > 10.0
+    assert RtsNoise.estimate(SimpleNamespace(z={}, n_frames=4000, maps=MAPS)) == []
