@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from collections.abc import Iterable
 
 #: Symbol (mathtext), words and stored unit of each map.
 _SYMBOLS = {
@@ -161,6 +162,17 @@ def count(number: int, noun: str) -> str:
     """Return ``1 pixel``, ``2 pixels``, ``17,750 frames``."""
     plural = "" if number == 1 else "s"
     return f"{number:,} {noun}{plural}"
+
+
+def first_few(parts: Iterable[object], most: int = 4) -> str:
+    """Return the first of some parts in words, and how many more there are.
+
+    Example:
+        >>> first_few(range(6))
+        '0, 1, 2, 3 and 2 more'
+    """
+    words = [str(part) for part in parts]
+    return ", ".join(words[:most]) + (f" and {len(words) - most:,} more" if len(words) > most else "")
 
 
 def probability_text(p: float) -> str:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.wording import first_few
 from pchem_pipeline.frames.reader import FrameReader
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
-_LISTED = 4
 #: bytes of a frame that may hold a stamp; rows and columns of a text beside it
 _STAMP_BYTES, _TEXT = 40, (8, 271)
 #: frames that must be counted: few that tell most stacks, and all that are looked at
@@ -73,9 +73,7 @@ def _are(number: int) -> str:
 
 def _places(numbers: Sequence[int]) -> str:
     """Return the first frames of a list, in words."""
-    listed = ", ".join(map(str, numbers[:_LISTED]))
-    more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
-    return f"frame{'s' * (len(numbers) > 1)} {listed}{more}"
+    return f"frame{'s' * (len(numbers) > 1)} {first_few(numbers)}"
 
 
 def stamped_pixels(frames: FrameSequence) -> BoolArray | None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.base.variables import MEASURED_MAPS, VARIABLES
-from pchem_pipeline.base.wording import count, measured, p_value_text, short, symbol
+from pchem_pipeline.base.wording import count, first_few, measured, p_value_text, short, symbol
 from pchem_pipeline.commands.compare.history import (
     HISTORY,
     PixelStates,
@@ -346,11 +346,14 @@ def _limit_words(limit: float | str, unit: str) -> str:
 
 
 def _map_words(each: MapDifference, why: Reasons, limit: float | str | None, unit: str) -> str:
+    text = [f"scatter {short(each.spread_z, 2)} sigma"] if why.spread and not why.shifted else []
     if why.shifted:
-        words = f"median changed by {measured(each.median, each.median_stderr, unit)}"
-        return words if limit is None else f"{words}, limit {_limit_words(limit, unit)}"
-    text = [f"scatter {short(each.spread_z, 2)} sigma"] if why.spread else []
-    if why.pixels:
+        text.append(f"median changed by {measured(each.median, each.median_stderr, unit)}")
+    if why.lines:
+        text.append(f"{first_few(why.lines)} changed against the others")
+    if limit is not None:
+        text.append(f"limit {_limit_words(limit, unit)}")
+    if why.pixels and not why.shifted:
         text.append(f"{count(each.n_changed, 'pixel')} changed, {p_value_text(each.p_value)}")
     return ", ".join(text)
 

@@ -34,6 +34,7 @@ from pydantic import (
 )
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.wording import first_few
 
 if TYPE_CHECKING:
     from pchem_pipeline.base.arrays import BoolArray, IntArray
@@ -327,10 +328,9 @@ _KEYS = {
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    shown = [str(number) for number in numbers[:_FEW]]
-    if len(numbers) > _FEW:
-        return f"{', '.join(shown)} and {len(numbers) - _FEW} more"
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
+    if len(numbers) > _FEW or len(numbers) == 1:
+        return first_few(numbers, _FEW)
+    return f"{', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
 
 
 def _range_words(noun: str, spans: tuple[Span, ...]) -> str:

@@ -12,20 +12,12 @@ from pydantic import Field, field_validator, model_validator
 from scipy import special
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.wording import first_few
 from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.context import ALL_ROWS
 from pchem_pipeline.effects.framework.draws import OF_PIXEL
-from pchem_pipeline.effects.framework.effect import (
-    MOST_TOLD,
-    Count,
-    Dn,
-    Effect,
-    Electrons,
-    Factors,
-    Plane,
-    Ratio,
-)
+from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, Electrons, Factors, Plane, Ratio
 from pchem_pipeline.effects.framework.evidence import PreviousBits
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Region, Span
@@ -651,12 +643,5 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
             followed.setdefault(term.describe(), []).append(
                 f"{100.0 * self.response * term.weight:+.2g} %{only}"
             )
-        words = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
-        more = f", and {len(followed) - MOST_TOLD} more" if len(followed) > MOST_TOLD else ""
-        return f"samples{in_place(self)} depend on the charge of other samples ({', '.join(words)}{more})"
-
-
-def _few(parts: Sequence[str]) -> str:
-    """Return the first of some parts in words, and how many more there are."""
-    more = f" and {len(parts) - MOST_TOLD} more" if len(parts) > MOST_TOLD else ""
-    return f"{', '.join(parts[:MOST_TOLD])}{more}"
+        words = first_few(f"{first_few(parts)} of {what}" for what, parts in followed.items())
+        return f"samples{in_place(self)} depend on the charge of other samples ({words})"

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, require
+from pchem_pipeline.base.wording import first_few
 from pchem_pipeline.frames.camera import (
     TIME_UNIT,
     CameraFacts,
@@ -190,8 +191,7 @@ def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
     differing = [name for name in _ALIKE if len({kind[name] for kind in kinds}) > 1]
     single = all(n and hdu.header["NAXIS"] == 2 for n, hdu in images)
     if not images or (len(images) > 1 and (differing or not single)):
-        names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
-        names += f" and {len(images) - 12} more" if len(images) > 12 else ""
+        names = first_few((f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images), 12) or "none"
         names += f", which differ in {', '.join(differing[:4])}" if differing else ""
         raise InputError(
             f"{path}: images in the file{' with this name' * (settings.dataset is not None)}: {names}; "

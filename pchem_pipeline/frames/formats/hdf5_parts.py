@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import InputError, install_hint
+from pchem_pipeline.base.wording import first_few
 from pchem_pipeline.frames.reader import unwritten_notes
 
 #: parts of a virtual dataset, and virtual datasets within each other
@@ -40,9 +41,8 @@ def check_links(path: Path, file: Any, wanted: str | None) -> None:
 
     names = [name for name in found if wanted is None or name == wanted.strip("/")]
     if asked := [f"{name} in {found[name]}" for name in names if may_be_a_stack(name)]:
-        more = f" and {len(asked) - 4} more" if len(asked) > 4 else ""
         raise InputError(
-            f"{path}: its frames are in other files: {', '.join(asked[:4])}{more}; give those, with "
+            f"{path}: its frames are in other files: {first_few(asked)}; give those, with "
             "--integration-time and --bit-depth from this file, or choose a dataset with --dataset"
         )
 

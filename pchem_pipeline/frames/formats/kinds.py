@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.wording import first_few
 from pchem_pipeline.frames.settings import InputSettings
 
 #: rows or columns, above which a header is damaged; it keeps a row of frames in memory
@@ -221,8 +222,7 @@ def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: st
     stacks = [name for name, shape in shapes.items() if len(shape) >= 3]
     images = [name for name, shape in shapes.items() if len(shape) == 2]
     names = [*stacks, *images]
-    listed = ", ".join(f"{name} {shapes[name]}" for name in names[:12])
-    listed += f" and {len(names) - 12} more" if len(names) > 12 else ""
+    listed = first_few((f"{name} {shapes[name]}" for name in names), 12)
     if wanted is not None:
         name = wanted.strip("/")
         if name in shapes:

@@ -143,6 +143,25 @@ def test_a_median_counts_where_it_is_significantly_beyond_its_limit(limit):
     assert found.limit == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize("limit", [None, 2.0])
+def test_a_column_that_moved_against_the_others_is_named(limit):
+    """Its median of 100 differences has a standard error of 0.18, a tenth added for those of the fits."""
+    error = np.ones(SHAPE)
+    moved_by = lambda change: np.where(np.arange(SHAPE[1]) == 7, change, 0.0)  # noqa: E731
+    one, other = 100.0 + np.random.default_rng(5).standard_normal((2, *SHAPE))
+    least = (limit or 0.0) + 5.0 * 1.1 * np.sqrt(2.0 * np.pi / (2 * SHAPE[0]))
+    found = {
+        change: reasons_of_change(compared((one, error), (other + moved_by(change), error), limit=limit))
+        for change in (0.0, least - 1.0, least + 1.0)
+    }
+    assert [why.lines for why in found.values()] == [(), (), ("column 7",)]
+    # the whole sensor is no column, and odd pixels are none
+    everywhere = reasons_of_change(compared((one, error), (other + 3.0, error), limit=limit))
+    assert (everywhere.shifted, everywhere.lines) == (True, ())
+    other[:20, 3] += 100.0
+    assert reasons_of_change(compared((one, error), (other, error), limit=limit)).lines == ()
+
+
 def test_unchanged_nights_alarm_at_the_stated_rate():
     """Ten nights against the first and against the one before, in sets of six maps: 8 histories."""
     rng = np.random.default_rng(10)
