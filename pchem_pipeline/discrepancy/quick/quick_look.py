@@ -20,6 +20,7 @@ import numpy as np
 from scipy import special
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.wording import first_few
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook, check_of, graded
@@ -254,9 +255,7 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
     out = some[p < 1e-3 / p.size]
     if width:
         out = np.unique(out % width)
-    shown = ", ".join(str(i) for i in out[:_SHOWN])
-    more = f" and {out.size - _SHOWN} more" if out.size > _SHOWN else ""
-    words = f"mainly in {line}{'s' if out.size > 1 else ''} {shown}{more}" if out.size else ""
+    words = f"mainly in {line}{'s' * (out.size > 1)} {first_few(out, _SHOWN)}" if out.size else ""
     return look_elsewhere(float(p.min()), p.size), words
 
 

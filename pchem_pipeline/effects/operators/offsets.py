@@ -397,8 +397,8 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         return SharedOffset("wave", variance, self.cycles_per_row, self.cycles_per_column)
 
 
-# frames in a record of noise, of which one is used: what is cut from a longer one has no period
-_RECORD = 4
+# successive frames through which a record of noise goes on
+_RECORD = 8
 
 
 class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
@@ -410,7 +410,8 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
     2015; Pyxel ``correlated_pink_noise_cmos``).
 
     Signature: row means of the readout residual scatter, those of adjacent rows alike, and neighbours along
-    the row are correlated more than pixels far apart in it. A pixel's own histogram only broadens.
+    the row are correlated more than pixels far apart in it. A pixel's own histogram only broadens. The noise
+    goes on from frame to frame, so that means of successive frames are a little alike.
     """
 
     title = "1/f noise along the readout"
@@ -464,16 +465,19 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         whole = max(self.rows or rows, rows)
         cycles = np.arange(_RECORD, _RECORD * whole // rows) / _RECORD
         shares = 1.0 / (cycles * (0.5 + _RECORD * math.log(max(whole * width / 2.0, 1.0))))
-        angles = math.tau * np.outer(cycles, np.arange(rows)) / whole
-        waves = np.concatenate([np.cos(angles), np.sin(angles)]) * np.sqrt(np.tile(shares, 2))[:, None]
+        angles = math.tau * cycles * (np.arange(rows)[:, None] / whole + np.arange(_RECORD)[:, None, None])
+        waves = np.concatenate([np.cos(angles), np.sin(angles)], axis=2) * np.sqrt(np.tile(shares, 2))
         rest = math.sqrt(max(1.0 - float(shares.sum()), 0.0))
-        for t, frame in enumerate(context.frames):
-            random = context.random.generator(frame=int(frame))
-            white = np.fft.rfft(random.standard_normal((taps, _RECORD * rows * width)))
-            record = np.fft.irfft(amplitudes * white, _RECORD * rows * width)
-            series = rest * record[:, : rows * width].reshape(taps, rows, width)
-            series += (random.standard_normal((taps, len(waves))) @ waves)[:, :, None]
-            noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
+        numbers = context.frames // _RECORD
+        for number in np.unique(numbers):
+            random = context.random.generator(frame=int(number))
+            white = np.fft.rfft(random.standard_normal((taps, _RECORD * rows * width), np.float32))
+            record = rest * np.fft.irfft(amplitudes * white, _RECORD * rows * width)
+            series = record.reshape(taps, _RECORD, rows, width)
+            series += np.moveaxis(waves @ random.standard_normal((2 * cycles.size, taps)), 2, 0)[..., None]
+            some = np.flatnonzero(numbers == number)
+            read = series[:, context.frames[some] % _RECORD][:, :, context.rows]
+            noise[some] = read.transpose(1, 2, 0, 3).reshape(some.size, -1, taps * width)[:, :, :columns]
         noise *= self.noise_dn
         return noise
 

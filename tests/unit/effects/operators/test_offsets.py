@@ -124,6 +124,27 @@ def test_some_rows_of_a_frame_have_its_slow_noise():
     assert effect.to_window((24, 32), (0, 6), (64, 6)).to_sensor((24, 32), (0, 6), (64, 6)) == effect
 
 
+@pytest.mark.parametrize("rows", [24, 12])
+def test_noise_in_read_order_goes_on_from_frame_to_frame(rows):
+    """Means of successive frames, of all rows or half of them, are as alike as those of one long record."""
+    n, frames = 24 * 6, 8000
+    frequency = np.fft.rfftfreq(n * frames)
+    phase = np.random.default_rng(2).standard_normal((2, frequency.size))
+    spectrum = np.where(frequency * n >= 1, np.maximum(frequency, 1e-9) ** -0.5, 0.0)
+    record = np.fft.irfft(spectrum * (phase[0] + 1j * phase[1]), n * frames).reshape(frames, 24, 6)[:, :rows]
+    effect = ReadOrderNoise(noise_dn=2.0).to_window((0, rows), (0, 6), (24, 6))
+    alike = [
+        np.corrcoef(means[1:], means[:-1])[0, 1]
+        for means in (
+            record.mean(axis=(1, 2)),
+            offsets(effect, context_of((rows, 6), frames)).mean(axis=(1, 2)),
+        )
+    ]
+    assert abs(alike[0]) > 10 / np.sqrt(frames)
+    # a record of eight frames follows none, and ends as it begins
+    assert alike[1] == pytest.approx(alike[0], rel=0.25, abs=5 / np.sqrt(frames))
+
+
 # one tap, one tap, four
 @pytest.mark.parametrize("seed", [180000, 180001, 180003])
 def test_an_independent_camera_s_noise_is_among_the_guesses(seed):
