@@ -83,9 +83,12 @@ def _change(effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: i
     kind = type(effect)
 
     class Watched(kind):  # type: ignore[misc, valid-type]
+        def halo(self) -> int:
+            return int(maps.usable.shape[0])  # all rows are simulated together
+
         def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
             changed: NDArray[Any] = super().apply(values, context)
-            seen.append(changed.astype(np.float64) - values.astype(np.float64))
+            seen.append((changed.astype(np.float64) - values)[self.history() :])
             return changed
 
     everywhere = Watched.model_validate(effect.at_place(None).model_dump())

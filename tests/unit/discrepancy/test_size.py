@@ -39,6 +39,18 @@ def test_the_size_is_what_the_law_of_the_effect_says(
     assert size.of_read_noise == pytest.approx(size.dn / NOISE)
 
 
+def test_an_effect_that_goes_back_far_in_time_has_a_size() -> None:
+    """A trap that is full in a share f of the frames takes as often as it releases, f times the release."""
+    fields = {"tag": "trapping", "capture": 0.03, "release": 0.02}
+    effect = effect_class("trapping").model_validate(fields)
+    assert effect.history() > 500
+    size = size_of(effect, MAPS, 4000)
+    caught = fields["capture"] * (1.0 - np.exp(-EXPOSURE))
+    full = caught / (caught + fields["release"])
+    assert size.samples == pytest.approx(2.0 * full * fields["release"], rel=0.05)
+    assert size.electrons == pytest.approx(1.0, rel=0.01)
+
+
 @pytest.mark.parametrize("changes", ["offset", "light"])
 def test_a_measured_noise_has_the_size_that_was_measured(changes: str) -> None:
     """Light that varies by 5 % changes few samples, by whole electrons: that is their shot noise."""
