@@ -41,7 +41,6 @@ from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.sequence import FrameSequence
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command, StageContext, Task
 from pchem_pipeline.run.target import Target
@@ -88,7 +87,7 @@ def apply_to_frames(
     target = with_overrides(target, command)
     keep_to_limit(target.config.compute.max_memory)
     run = target.stored()
-    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
+    reporter = command.reporter()
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
