@@ -76,7 +76,7 @@ def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def even_offsets(
-    path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
+    n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
 ) -> IntArray:
     """Return the byte offsets of frames that lie evenly in a file of ``size`` bytes, the first at ``start``.
 
@@ -87,21 +87,19 @@ def even_offsets(
     """
     step = frame_bytes if step is None else step
     if n_frames and frame_bytes < 1:
-        raise InputError(f"{path}: no frames; omit it")
+        raise InputError("no frames; omit it")
     end = start + step * (n_frames - 1) + frame_bytes
     if n_frames and end > size:
-        raise _truncated(path, n_frames, end, size, max(0, (size - start - frame_bytes) // step + 1))
+        raise _truncated(n_frames, end, size, max(0, (size - start - frame_bytes) // step + 1))
     if n_frames > _MOST_FRAMES:
-        raise InputError(
-            f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
-        )
+        raise InputError(f"{n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape")
     return start + step * np.arange(n_frames, dtype=np.int64)
 
 
-def _truncated(path: Path, n_frames: int, needed: int, size: int, whole: int) -> InputError:
+def _truncated(n_frames: int, needed: int, size: int, whole: int) -> InputError:
     return InputError(
-        f"{path}: truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} complete "
-        "frames); copy the file again"
+        f"truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} complete frames); "
+        "copy the file again"
     )
 
 
@@ -109,16 +107,15 @@ class OpenedFile:
     """A file open for one call; InputError if it vanished, or became shorter since it was inspected."""
 
     def __init__(self, path: Path, size: int) -> None:
-        self._path = path
         try:
             self._handle = os.open(path, os.O_RDONLY)
         except FileNotFoundError as error:
-            raise changed(path, "the file disappeared") from error
+            raise changed("the file disappeared") from error
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+            raise InputError(f"cannot be read ({error.strerror}); check its permissions") from error
         if os.fstat(self._handle).st_size < size:
             os.close(self._handle)
-            raise changed(path, "the file was truncated")
+            raise changed("the file was truncated")
 
     def __enter__(self) -> Self:
         return self
@@ -133,9 +130,9 @@ class OpenedFile:
             try:
                 count = os.preadv(self._handle, [target[done : done + _MOST_BYTES]], offset + done)
             except OSError as error:
-                raise InputError(f"{self._path}: read error ({error.strerror}); check the disk") from error
+                raise InputError(f"read error ({error.strerror}); check the disk") from error
             if count == 0:
-                raise changed(self._path, "the file was truncated")
+                raise changed("the file was truncated")
             done += count
 
     def read_bytes(self, offset: int, count: int) -> bytes:
@@ -148,6 +145,7 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `_decode_into`."""
 
+    _size: int  # of the file, bytes
     _offset: int | None = None
     _full: tuple[int, ...] = ()
 
@@ -156,39 +154,33 @@ class ContiguousReader(FrameReader):
         """See `FrameReader.open`."""
         reader = cls()
         with sound(path, cls.format_name, cls.magic):
+            reader.paths, reader._size = (path,), path.stat().st_size
             reader._inspect(path, settings)
-        reader.notes += axes_notes(path, reader._full)
+        reader.notes += axes_notes(reader._full)
         return reader
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         """Take from a file all that a reader says of it; any error becomes one line."""
         raise NotImplementedError
 
-    def set_layout(self, path: Path, layout: Layout, size: int) -> None:
-        """Take the layout; InputError: the file's ``size`` is less than the layout says."""
-        if layout.end > size:
-            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
-            raise _truncated(path, layout.offsets.size, layout.end, size, whole)
-        self.paths = (path,)
+    def set_layout(self, layout: Layout) -> None:
+        """Take the layout; InputError: the file is shorter than the layout says."""
+        if layout.end > self._size:
+            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= self._size))
+            raise _truncated(layout.offsets.size, layout.end, self._size, whole)
         self.shape = (layout.offsets.size, layout.rows, layout.columns)
         self.dtype = unsigned_type(layout.stored)
         self._layout = layout
-        self._size = size
 
     def set_stack(
-        self,
-        path: Path,
-        full: Sequence[int],
-        stored: np.dtype[Any],
-        settings: InputSettings | None,
-        what: str,
+        self, full: Sequence[int], stored: np.dtype[Any], settings: InputSettings | None, what: str
     ) -> None:
         """Set the stack's shape and type from those of the stored array; InputError: these are no frames.
 
         Without settings, the file says itself what its signed samples mean. Messages call the array ``what``.
         """
-        self._offset = None if settings is None else check_samples(path, stored, settings)
-        self.paths, self.shape = (path,), stack_shape(path, full, what)
+        self._offset = None if settings is None else check_samples(stored, settings)
+        self.shape = stack_shape(full, what)
         self.dtype, self._full = unsigned_type(stored), tuple(full)
 
     @property
@@ -206,12 +198,12 @@ class ContiguousReader(FrameReader):
             try:
                 self._decode_into(buffer, t0, t1, y0, y1)
             except FileNotFoundError as error:
-                raise changed(path, "the file disappeared") from error
+                raise changed("the file disappeared") from error
             except InputError:
                 raise
             except Exception as error:
-                raise InputError(f"{path}: cannot be decoded ({error}); copy it again") from error
-            unstore(buffer, self.dtype, self._offset, path)
+                raise InputError(f"cannot be decoded ({error}); copy it again") from error
+            unstore(buffer, self.dtype, self._offset)
             return
         if layout.packing is not None:
             self._read_packed(layout.packing, buffer, layout.offsets[t0:t1], y0 * layout.columns)
@@ -223,7 +215,7 @@ class ContiguousReader(FrameReader):
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
-        unstore(buffer, layout.stored, layout.offset, path)
+        unstore(buffer, layout.stored, layout.offset)
         self.put_right(buffer, t0, y0)
 
     def _read_packed(
@@ -252,7 +244,7 @@ def _runs(offsets: IntArray, frame_bytes: int) -> list[tuple[int, int]]:
     return [(a, b - a) for a, b in pairwise(edges)]
 
 
-def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
+def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None) -> None:
     """Turn stored bytes in a buffer of unsigned samples into these, in place.
 
     Floats hold whole numbers; an offset, 0 to 2**(bits - 1), is added to signed samples; None: unsigned.
@@ -267,8 +259,8 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
         whole = (values >= 0) & (values <= _LARGEST_WHOLE) & (values == np.floor(values))
         if not whole.all():
             raise InputError(
-                f"{path}: samples such as {values[~whole][0]:g}, raw whole numbers are needed; record them "
-                "without a correction, background or averaging"
+                f"samples such as {values[~whole][0]:g}, raw whole numbers are needed; record them without a "
+                "correction, background or averaging"
             )
         buffer[...] = values
         return
@@ -279,7 +271,7 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
         lowest = int(buffer.view(f"i{stored.itemsize}").min()) + offset
         if lowest < 0:
             raise InputError(
-                f"{path}: negative samples (down to {lowest} "
+                f"negative samples (down to {lowest} "
                 f"DN{f', with the offset of {offset}' if offset else ''}), 0 or more needed; set "
                 f"input.offset: {top} (--offset {top}) if 0 DN is stored as -{top}"
             )

@@ -52,30 +52,30 @@ class SpeReader(ContiguousReader):
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
-            head, size = stream.read(_HEADER_BYTES), path.stat().st_size
+            head = stream.read(_HEADER_BYTES)
         field = {name: struct.unpack_from(kind, head, place)[0] for name, (place, kind) in _FIELDS.items()}
         if field["samples"] not in _SAMPLES:
             raise InputError(
-                f"{path}: samples of type {field['samples']}; record whole numbers (16 or 32 bits), or "
-                "correct the name if this is no SPE file"
+                f"samples of type {field['samples']}; record whole numbers (16 or 32 bits), or correct the "
+                "name if this is no SPE file"
             )
         stored = np.dtype(_SAMPLES[field["samples"]])
         n, rows, columns, regions = (field[name] for name in ("frames", "rows", "columns", "regions"))
         step, footer = None, None
         if field["version"] >= 3 and field["footer"]:
-            footer = _footer(path, field["footer"], size)
+            footer = _footer(path, field["footer"], self._size)
             frame = next(footer.iterfind(".//{*}DataBlock[@type='Frame']"))
             parts = frame.findall(".//{*}DataBlock[@type='Region']")
             n, step, regions = int(frame.attrib["count"]), int(frame.attrib["stride"]), len(parts)
             rows, columns = (int(parts[0].attrib[name]) for name in ("height", "width"))
         if regions > 1:
-            raise InputError(f"{path}: {regions} regions of interest; record one")
+            raise InputError(f"{regions} regions of interest; record one")
         if rows < 1 or columns < 1 or n < 0:
-            raise InputError(f"{path}: damaged header ({n} frames, {rows} x {columns}); copy it again")
-        offset = None if stored.kind == "f" else check_samples(path, stored, settings)
+            raise InputError(f"damaged header ({n} frames, {rows} x {columns}); copy it again")
+        offset = None if stored.kind == "f" else check_samples(stored, settings)
         frame_bytes = rows * columns * stored.itemsize
-        offsets = even_offsets(path, n, frame_bytes, size, start=_HEADER_BYTES, step=step)
-        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
+        offsets = even_offsets(n, frame_bytes, self._size, start=_HEADER_BYTES, step=step)
+        self.set_layout(Layout(offsets, rows, columns, stored, offset))
         if footer is None:
             duration = duration_of("exp_sec", field["seconds"], "s")
             self.take_facts(StatedFacts(CameraFacts(temperature=celsius(field["temperature"])), duration))
@@ -112,12 +112,12 @@ class SpeReader(ContiguousReader):
 def _footer(path: Path, start: int, size: int) -> Any:
     """Return the root of the XML behind the frames."""
     if not _HEADER_BYTES <= start < size or size - start > _LARGEST_FOOTER:
-        raise InputError(f"{path}: truncated before its footer, or a damaged header; copy the file again")
+        raise InputError("truncated before its footer, or a damaged header; copy the file again")
     with path.open("rb") as stream:
         stream.seek(start)
         text = stream.read()
     if b"<!DOCTYPE" in text:  # entities can unfold without an end
-        raise InputError(f"{path}: its footer declares entities, which SPE files do not have; copy it again")
+        raise InputError("its footer declares entities, which SPE files do not have; copy it again")
     return ElementTree.fromstring(text)
 
 

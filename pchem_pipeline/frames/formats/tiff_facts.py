@@ -57,12 +57,10 @@ def check_chain(path: Path, size: int) -> None:
         seen: set[int] = set()
         while following:
             if len(seen) > _MOST_PAGES:
-                raise InputError(
-                    f"{path}: more than {_MOST_PAGES} pages; write several files, or an npy array"
-                )
+                raise InputError(f"more than {_MOST_PAGES} pages; write several files, or an npy array")
             if following in seen:
                 raise InputError(
-                    f"{path}: damaged: after {len(seen)} pages the list of pages is circular; copy it again"
+                    f"damaged: after {len(seen)} pages the list of pages is circular; copy it again"
                 )
             seen.add(following)
             stream.seek(following)
@@ -70,18 +68,17 @@ def check_chain(path: Path, size: int) -> None:
             stream.seek(following + count_bytes + min(tags, _MOST_TAGS) * tag_bytes)
             data = stream.read(pointer)
             if tags > _MOST_TAGS or len(data) < pointer:
-                raise _broken_chain(path, len(seen) - 1, size)
+                raise _broken_chain(len(seen) - 1, size)
             following = int.from_bytes(data, order)
         if not seen:
-            raise _broken_chain(path, 0, size)
+            raise _broken_chain(0, size)
 
 
-def _broken_chain(path: Path, pages: int, size: int) -> InputError:
+def _broken_chain(pages: int, size: int) -> InputError:
     if not pages:
-        return InputError(f"{path}: not a valid tiff file, or truncated (no pages); copy it again")
+        return InputError("not a valid tiff file, or truncated (no pages); copy it again")
     return InputError(
-        f"{path}: truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it "
-        "again"
+        f"truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it again"
     )
 
 
