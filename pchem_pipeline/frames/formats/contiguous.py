@@ -145,7 +145,7 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `_decode_into`."""
 
-    _size: int  # of the file, bytes
+    size: int  # of the file, bytes
     _offset: int | None = None
     _full: tuple[int, ...] = ()
 
@@ -154,7 +154,7 @@ class ContiguousReader(FrameReader):
         """See `FrameReader.open`."""
         reader = cls()
         with sound(path, cls.format_name, cls.magic):
-            reader.paths, reader._size = (path,), path.stat().st_size
+            reader.paths, reader.size = (path,), path.stat().st_size
             reader._inspect(path, settings)
         reader.notes += axes_notes(reader._full)
         return reader
@@ -165,9 +165,9 @@ class ContiguousReader(FrameReader):
 
     def set_layout(self, layout: Layout) -> None:
         """Take the layout; InputError: the file is shorter than the layout says."""
-        if layout.end > self._size:
-            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= self._size))
-            raise _truncated(layout.offsets.size, layout.end, self._size, whole)
+        if layout.end > self.size:
+            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= self.size))
+            raise _truncated(layout.offsets.size, layout.end, self.size, whole)
         self.shape = (layout.offsets.size, layout.rows, layout.columns)
         self.dtype = unsigned_type(layout.stored)
         self._layout = layout
@@ -211,7 +211,7 @@ class ContiguousReader(FrameReader):
         skip = y0 * layout.columns * layout.stored.itemsize
         target = buffer.data.cast("B")
         band = len(target) // (t1 - t0)
-        with OpenedFile(path, self._size) as file:
+        with OpenedFile(path, self.size) as file:
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
@@ -224,7 +224,7 @@ class ContiguousReader(FrameReader):
         """Fill the buffer from frames whose samples are packed, from one of their samples on."""
         n_samples = buffer[0].size
         start, end, before = packing.span(first_sample, first_sample + n_samples)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             for frame, offset in zip(buffer, offsets.tolist(), strict=True):
                 data = np.frombuffer(file.read_bytes(offset + start, end - start), np.uint8)
                 frame.ravel()[:] = packing.unpacked(data)[before : before + n_samples]

@@ -73,7 +73,7 @@ class DcimgReader(ContiguousReader):
             )
         behind = 0 if version == _OLD else footer
         step, wide = frame_bytes + behind, row_bytes // depth
-        offsets = even_offsets(n, frame_bytes, self._size, start=session + start, step=step)
+        offsets = even_offsets(n, frame_bytes, self.size, start=session + start, step=step)
         self.set_layout(Layout(offsets, rows, wide, np.dtype(f"<u{depth}")))
         if sessions > 1:
             self.notes += (f"{sessions} sessions, the first is read",)
@@ -91,7 +91,7 @@ class DcimgReader(ContiguousReader):
         """Take what the footer of version 7 says, which begins at ``start``."""
         n, stamps = self.shape[0], start + _BEFORE_STAMPS
         self._check_end(stamps + _STAMP * n)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             (table,) = _FOOTER.unpack(file.read_bytes(start, _FOOTER.size))
             self._check_end(start + table + _TABLE.size)
             at, place, n_bytes = _TABLE.unpack(file.read_bytes(start + table, _TABLE.size))
@@ -107,7 +107,7 @@ class DcimgReader(ContiguousReader):
         starts = (self._layout.offsets + frame_bytes).tolist()
         self._check_end(starts[-1] + n_bytes)
         numbers = np.empty((len(starts), 3), "<u4")
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             for line, start in zip(numbers, starts, strict=True):
                 file.read_into(line.data.cast("B"), start)
             n_apart = len(_MARKER) if n_bytes == 32 or n_bytes >= 512 else 0
@@ -149,7 +149,7 @@ class DcimgReader(ContiguousReader):
         self._apart = start, step, row, slice(column, end)
 
     def _check_end(self, end: int) -> None:
-        if end > self._size:
+        if end > self.size:
             raise InputError("truncated in its footer; copy the file again")
 
     def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
@@ -159,7 +159,7 @@ class DcimgReader(ContiguousReader):
         start, step, row, columns = self._apart
         stored = self._layout.stored
         n_bytes = stored.itemsize * (columns.stop - columns.start)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             for t, frame in enumerate(buffer, t0):
                 frame[row - y0, columns] = np.frombuffer(file.read_bytes(start + t * step, n_bytes), stored)
 

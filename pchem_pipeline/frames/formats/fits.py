@@ -112,13 +112,13 @@ class FitsReader(ContiguousReader):
             end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
             self._read_facts(primary, header)
         if compressed:
-            if end > self._size:
-                raise InputError(f"truncated: {end} bytes needed, the file has {self._size}; copy it again")
-            check_coded(self.shape, hdu.tile_shape, stored.itemsize, self._size)
+            if end > self.size:
+                raise InputError(f"truncated: {end} bytes needed, the file has {self.size}; copy it again")
+            check_coded(self.shape, hdu.tile_shape, stored.itemsize, self.size)
             return
         offsets = np.array(starts, np.int64)
         if not several:
-            offsets = even_offsets(n, rows * columns * stored.itemsize, self._size, start=starts[0])
+            offsets = even_offsets(n, rows * columns * stored.itemsize, self.size, start=starts[0])
         self.set_layout(Layout(offsets, rows, columns, stored, zero or self._offset))
 
     def _read_facts(self, *headers: Any) -> None:
@@ -161,7 +161,7 @@ class FitsReader(ContiguousReader):
         from astropy.io import fits
 
         path = self.paths[0]
-        if path.stat().st_size != self._size:
+        if path.stat().st_size != self.size:
             raise changed("the size of the file changed")
         with _LOCK, fits.open(path, memmap=False) as hdus:
             if len(self._numbers) == 1:

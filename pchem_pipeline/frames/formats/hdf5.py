@@ -108,12 +108,12 @@ class Hdf5Reader(ContiguousReader):
         check_filters(dataset)
         if dataset.is_virtual:
             held = sum(part.stat().st_size for part in virtual_files(path, dataset))
-            check_coded(self.shape, self.shape[1:], self.dtype.itemsize, self._size + held)
+            check_coded(self.shape, self.shape[1:], self.dtype.itemsize, self.size + held)
         self.notes = check_sources(path, dataset)
         if "MATLAB_class" in dataset.attrs:  # it writes axes in reverse order
             self.notes += ("written by MATLAB: last axis read as frames, columns as rows",)
         if dataset.chunks is not None:
-            check_coded(self.shape, dataset.chunks, self.dtype.itemsize, self._size)
+            check_coded(self.shape, dataset.chunks, self.dtype.itemsize, self.size)
             _check_chunks(dataset)
         missing = _missing_chunks(path, dataset)
         self.notes += missing

@@ -104,6 +104,18 @@ def axes_notes(shape: Sequence[int]) -> tuple[str, ...]:
     )
 
 
+def channel_notes(channels: int, images: int) -> list[str]:
+    """Say that images called channels are read as frames; refuse those that have another axis, too."""
+    if channels < 2 or images < 2:
+        return []
+    if images > channels:
+        raise InputError(
+            f"its metadata describe the {images} images as {channels} channels of {images // channels}; "
+            "write each channel by itself"
+        )
+    return [f"its metadata describe the images as {channels} channels; read as frames"]
+
+
 def mosaic_note(pattern: str) -> str:
     """Return the remark on a sensor whose pixels lie behind filters of several colours."""
     return (

@@ -40,7 +40,7 @@ class Nd2Reader(ContiguousReader):
             raise InputError(f"{about.componentCount} channels or colours; export one channel as TIFF")
         shape = about.sequenceCount, about.heightPx, about.widthPx or 0
         self.set_stack(shape, dtype, settings, "stack")
-        check_coded(self.shape, shape[1:], dtype.itemsize, self._size)
+        check_coded(self.shape, shape[1:], dtype.itemsize, self.size)
         camera = re.match(r"([^\r\n,]+)(?:, *SN: *([\w-]+))?", words)
         exposure = re.search(r"Exposure: *([\d.]+ *\w+)", words)
         self.take_facts(
@@ -59,7 +59,7 @@ class Nd2Reader(ContiguousReader):
         import nd2
 
         path = self.paths[0]
-        if path.stat().st_size != self._size:
+        if path.stat().st_size != self.size:
             raise changed("the size of the file changed")
         with nd2.ND2File(path) as file:
             for t, frame in enumerate(buffer, t0):

@@ -39,9 +39,9 @@ class NpyReader(ContiguousReader):
         n, rows, columns = self.shape
         if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
             raise InputError("Fortran order; save it with numpy.save(..., numpy.ascontiguousarray(frames))")
-        offsets = even_offsets(n, rows * columns * dtype.itemsize, self._size, start=start)
+        offsets = even_offsets(n, rows * columns * dtype.itemsize, self.size, start=start)
         self.set_layout(Layout(offsets, rows, columns, dtype, self._offset))
-        behind = self._size - max(start, self._layout.end)
+        behind = self.size - max(start, self._layout.end)
         if behind:
             self.notes = (f"{behind} bytes after the array are ignored",)
 

@@ -145,7 +145,7 @@ class RawReader(ContiguousReader):
             )
         frame = layout.frame_bytes
         step = frame + padding
-        size = self._size
+        size = self.size
         whole, rest = divmod(size - header, step) if size >= header else (0, size)
         if rest == frame:  # the padding of the last frame may be missing
             whole, rest = whole + 1, 0

@@ -53,12 +53,12 @@ class SerReader(ContiguousReader):
             raise InputError(f"damaged header ({n} frames, {rows} x {columns}, {depth} bits); copy it again")
         order = settings.byte_order or ("big" if flag else "little")
         stored = np.dtype("u1" if depth <= 8 else "u2").newbyteorder(order)
-        offsets = even_offsets(n, rows * columns * stored.itemsize, self._size, start=_HEADER.size)
+        offsets = even_offsets(n, rows * columns * stored.itemsize, self.size, start=_HEADER.size)
         self.set_layout(Layout(offsets, rows, columns, stored))
         self.bit_depth, self.byte_order = depth, order
         taken = (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
         end = self._layout.end
-        if n and self._size >= end + 8 * n:  # there is a trailer of times
+        if n and self.size >= end + 8 * n:  # there is a trailer of times
             times = np.fromfile(path, "<i8", n, offset=end)
             if (times > 0).all():
                 self.timestamps = (times - _EPOCH) * 1e-7

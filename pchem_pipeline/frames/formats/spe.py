@@ -63,7 +63,7 @@ class SpeReader(ContiguousReader):
         n, rows, columns, regions = (field[name] for name in ("frames", "rows", "columns", "regions"))
         step, footer = None, None
         if field["version"] >= 3 and field["footer"]:
-            footer = _footer(path, field["footer"], self._size)
+            footer = _footer(path, field["footer"], self.size)
             frame = next(footer.iterfind(".//{*}DataBlock[@type='Frame']"))
             parts = frame.findall(".//{*}DataBlock[@type='Region']")
             n, step, regions = int(frame.attrib["count"]), int(frame.attrib["stride"]), len(parts)
@@ -74,7 +74,7 @@ class SpeReader(ContiguousReader):
             raise InputError(f"damaged header ({n} frames, {rows} x {columns}); copy it again")
         offset = None if stored.kind == "f" else check_samples(stored, settings)
         frame_bytes = rows * columns * stored.itemsize
-        offsets = even_offsets(n, frame_bytes, self._size, start=_HEADER_BYTES, step=step)
+        offsets = even_offsets(n, frame_bytes, self.size, start=_HEADER_BYTES, step=step)
         self.set_layout(Layout(offsets, rows, columns, stored, offset))
         if footer is None:
             duration = duration_of("exp_sec", field["seconds"], "s")
@@ -91,9 +91,9 @@ class SpeReader(ContiguousReader):
             places.setdefault(element.get("event") or element.tag.rpartition("}")[2], (at, element))
             at += int(element.get("bitDepth", 0)) // 8
         offsets = self._layout.offsets + self._layout.frame_bytes
-        if not at or not n or int(offsets[-1]) + at > self._size:
+        if not at or not n or int(offsets[-1]) + at > self.size:
             return
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             data = [file.read_bytes(offset, at) for offset in offsets.tolist()]
         numbers = {
             name: np.array([struct.unpack_from("<q", each, place)[0] for each in data])

@@ -25,7 +25,7 @@ from pchem_pipeline.frames.formats.contiguous import (
     even_offsets,
     unsigned_type,
 )
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, mosaic_note
+from pchem_pipeline.frames.formats.kinds import channel_notes, check_coded, check_samples, mosaic_note
 from pchem_pipeline.frames.formats.tiff_facts import (
     LINEARIZATION_TAG,
     active_area,
@@ -59,7 +59,7 @@ class TiffReader(ContiguousReader):
         import tifffile
 
         logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
-        check_chain(path, self._size)
+        check_chain(path, self.size)
         with tifffile.TiffFile(path) as file:
             every = [*file.pages]
             pages = [page for page in every if not page.is_reduced]
@@ -74,10 +74,12 @@ class TiffReader(ContiguousReader):
             _check_pages(pages)
             offset = check_samples(np.dtype(first.dtype), settings)
             count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
-            notes += _channel_notes(*stated_channels(file), count) + _value_notes(pages)
+            channels, images = stated_channels(file)
+            notes += channel_notes(channels, images if images == count else min(count, channels))
+            notes += _value_notes(pages)
             self.notes = tuple(notes)
             stored = np.dtype(first.dtype).newbyteorder(file.byteorder)
-            offsets = _contiguous_offsets(file, pages, self._size)
+            offsets = _contiguous_offsets(file, pages, self.size)
             rows, columns = first.shape[-2:]
             if offsets is not None:
                 self.set_layout(Layout(offsets, rows, columns, stored, offset))
@@ -88,16 +90,16 @@ class TiffReader(ContiguousReader):
 
     def _set_coded(self, pages: Sequence[Any], offset: int | None) -> None:
         """Remember where the pages are, after a look at where their strips or tiles are."""
-        broken = [page for page in pages if _reaches_beyond(page, self._size)]
+        broken = [page for page in pages if _reaches_beyond(page, self.size)]
         if broken:
             raise InputError(
                 f"truncated: {len(broken)} of {len(pages)} pages extend beyond the end of the file "
-                f"({self._size} bytes); copy the file again"
+                f"({self.size} bytes); copy the file again"
             )
         rows, columns = pages[0].shape
         piece = max((page.chunks for page in pages), key=math.prod)
         stored = np.dtype(pages[0].dtype)
-        check_coded((len(pages), rows, columns), piece, stored.itemsize, self._size)
+        check_coded((len(pages), rows, columns), piece, stored.itemsize, self.size)
         self.shape, self.dtype = (len(pages), rows, columns), unsigned_type(stored)
         self._offset = offset
         self.rows_per_read = min(rows, max(page.chunks[0] for page in pages))
@@ -107,7 +109,7 @@ class TiffReader(ContiguousReader):
         import tifffile
 
         path = self.paths[0]
-        with OpenedFile(path, self._size) as file, tifffile.TiffFile(path) as known:
+        with OpenedFile(path, self.size) as file, tifffile.TiffFile(path) as known:
             for t in range(t0, t1):
                 known.filehandle.seek(int(self._places[t]))
                 page = tifffile.TiffPage(known, t)
@@ -140,18 +142,6 @@ def _decode(page: Any, file: OpenedFile, frame: NDArray[Any], y0: int, y1: int) 
             target[...] = page.nodata
         else:
             target[...] = segment[0, low - top : high - top, : target.shape[1], 0]
-
-
-def _channel_notes(channels: int, images: int, pages: int) -> list[str]:
-    """Say that pages called channels are read as frames; refuse those that have another axis, too."""
-    if channels < 2 or pages < 2:
-        return []
-    if images == pages > channels:
-        raise InputError(
-            f"its metadata describe the {pages} pages as {channels} channels of {pages // channels} images; "
-            "write one file per channel"
-        )
-    return [f"its metadata describe the pages as {channels} channels; read as frames"]
 
 
 def _value_notes(pages: Sequence[Any]) -> list[str]:

@@ -17,6 +17,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import (
+    channel_notes,
     check_coded,
     check_unpacked_size,
     choose_dataset,
@@ -84,7 +85,7 @@ class ZarrReader(ContiguousReader):
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
-        self.notes = _channel_notes(_axes(node), self._full)
+        self.notes = (*channel_notes(_channels(node, self._full), self.shape[0]),)
         missing = _check_chunks(path / self._name, array, parts)
         self.notes += missing
         self.unwritten = bool(missing)
@@ -152,22 +153,12 @@ def _scales(group: Any) -> Any:
     return record.get("multiscales") if hasattr(record, "get") else None
 
 
-def _axes(node: Any) -> list[str]:
-    """Return the names of the axes of an OME-Zarr image (of versions before 0.3 always the same)."""
+def _channels(node: Any, shape: Sequence[int]) -> int:
+    """Return the length of the axis of channels of an OME-Zarr image of some shape; 1 where it has none."""
     scales = _scales(node)
-    axes = scales[0].get("axes", "tczyx") if scales else []
-    return [str(axis.get("name", "") if hasattr(axis, "get") else axis) for axis in axes]
-
-
-def _channel_notes(axes: Sequence[str], shape: Sequence[int]) -> tuple[str, ...]:
-    """Say that channels are read as frames; refuse those that have another axis, too."""
-    if "c" not in axes or len(axes) != len(shape) or (channels := shape[axes.index("c")]) < 2:
-        return ()
-    if channels < math.prod(shape[:-2]):
-        raise InputError(
-            f"its metadata describe {channels} channels beside frames; write one array per channel"
-        )
-    return (f"its metadata describe the images as {channels} channels; read as frames",)
+    axes = scales[0].get("axes", "tczyx") if scales else []  # of versions before 0.3 always the same
+    names = [axis.get("name", "") if hasattr(axis, "get") else axis for axis in axes]
+    return shape[names.index("c")] if "c" in names and len(names) == len(shape) else 1
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:

@@ -259,7 +259,7 @@ def test_ome_zarr(tmp_path, version):
     check_reads(opened(path), STACK)
     group.attrs.update({"multiscales": scales, "ome": {"multiscales": [{"datasets": [{"path": "two"}]}]}})
     group.create_array("two", data=np.zeros((4, 2, 1, 8, 9), np.uint16))
-    refused("2 channels beside frames; write one array per channel", path)
+    refused("as 2 channels of 4; write each channel by itself", path)
 
 
 @pytest.mark.parametrize("chunks", [None, (1, 7, 19, 22), (2, 3, 8, 22)])
