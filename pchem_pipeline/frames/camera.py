@@ -115,13 +115,8 @@ class Duration(NamedTuple):
     words: str
 
 
-@dataclass(frozen=True)
-class StatedFacts:
-    """What a file says beside its frames, the bits of the ADC among it; None where it does not."""
-
-    camera: CameraFacts = CameraFacts()
-    duration: Duration | None = None
-    bit_depth: int | None = None
+#: What a file says beside its frames: camera, integration time, bits of the ADC; None where it does not.
+Stated = tuple[CameraFacts, Duration | None, int | None]
 
 
 def text_of(value: Any) -> str | None:
@@ -236,7 +231,7 @@ def bits_of(value: Any) -> int | None:
     return int(value) if whole and 1 <= int(value) <= 32 else None
 
 
-def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -> StatedFacts:
+def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -> Stated:
     """Return the facts from values, with their units, under the names that most programs use."""
 
     def units_of(name: str) -> list[Any]:
@@ -263,9 +258,7 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -
         first_of(seconds_of(values.get(name)) for name in _TIMES),
         texts_of(values, _SETUP),
     )
-    return StatedFacts(
-        camera, agreed_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
-    )
+    return camera, agreed_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
 
 
 def first_of(found: Iterable[Any]) -> Any:

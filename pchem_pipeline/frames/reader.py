@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
-from pchem_pipeline.base.errors import InputError, PchEmError, error_words
-from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
+from pchem_pipeline.base.errors import InputError, PchEmError, error_words, unreadable
+from pchem_pipeline.frames.camera import CameraFacts, Duration
 from pchem_pipeline.frames.settings import Area, InputSettings
 
 
@@ -103,10 +103,12 @@ class FrameReader(ABC):
             self.read_into(buffer, t0, t1, y0, y1)
         return buffer
 
-    def take_facts(self, facts: StatedFacts) -> None:
+    def take_facts(
+        self, camera: CameraFacts, duration: Duration | None = None, bit_depth: int | None = None
+    ) -> None:
         """Take what the file says beside its frames."""
-        self.camera, self.bit_depth = facts.camera, facts.bit_depth
-        self.integration_time, self.time_words = facts.duration or (None, "")
+        self.camera, self.bit_depth = camera, bit_depth
+        self.integration_time, self.time_words = duration or (None, "")
 
     def cards(self) -> tuple[Any, ...]:
         """Return the cards of a FITS file that are not of its samples or their place; else none."""
@@ -188,7 +190,7 @@ def sound(path: Path, name: str, magic: tuple[bytes, ...] = ()) -> Iterator[None
         raise
     except Exception as error:
         if isinstance(error, FileNotFoundError | PermissionError) and error.strerror:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+            raise unreadable(path, error) from error
         words = f"not a valid {name} file, or truncated ({error_words(error)}); copy it again"
         if magic and path.is_file() and not np.fromfile(path, "u1", 64).tobytes().startswith(magic):
             words = f"does not begin as {name} files do; correct its name, or copy it again"

@@ -222,16 +222,14 @@ def _is_wanted(output: Path, found: dict[str, Any], content: dict[str, Any], *, 
     """Return whether an output is the wanted one; raise ConfigError unless it is, or may be replaced."""
     if found == content and not force:
         return True
-    ours = found.get("product") == _PRODUCT
-    if not (force and ours):
-        raise _exists(output, ours=ours)
+    if found.get("product") != _PRODUCT:
+        raise ConfigError(f"{output} exists and has no calibrated frames; choose another --output")
+    if not force:
+        raise ConfigError(
+            f"{output} exists and was made from other frames or with other settings; choose another "
+            "--output, or replace it with --force"
+        )
     return False
-
-
-def _exists(output: Path, *, ours: bool) -> ConfigError:
-    cure = ", or replace it with --force" if ours else ""
-    what = "was made from other frames or with other settings" if ours else "has no calibrated frames"
-    return ConfigError(f"{output} exists and {what}; choose another --output{cure}")
 
 
 def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple[RunStore, bool]:
@@ -239,7 +237,7 @@ def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple
     names = {each.name for each in place.iterdir()} if place.is_dir() else set()
     begun = {name for name in names if not name.startswith(".zarr.json.")}  # not what a killed process left
     if "zarr.json" not in begun and (begun or (place.exists() and not place.is_dir())):
-        raise _exists(place, ours=False)
+        _is_wanted(place, {}, content, force=force)
     if not begun <= {"zarr.json", ".pchem"}:
         found: dict[str, Any] = {}
         with contextlib.suppress(StoreError):

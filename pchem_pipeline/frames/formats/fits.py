@@ -25,7 +25,6 @@ from pchem_pipeline.frames.camera import (
     TIME_UNIT,
     CameraFacts,
     Duration,
-    StatedFacts,
     agreed_duration,
     bits_of,
     celsius,
@@ -141,7 +140,7 @@ class FitsReader(ContiguousReader):
 
         self.active, self.overscan = area_of(_ACTIVE_KEYWORDS), area_of(_OVERSCAN_KEYWORDS)
         depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
-        self.take_facts(StatedFacts(_camera(last), duration, first_of(depths)))
+        self.take_facts(_camera(last), duration, first_of(depths))
 
     def cards(self) -> tuple[Any, ...]:
         """See `FrameReader.cards`."""

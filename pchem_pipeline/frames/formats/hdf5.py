@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError, quoted, require
-from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
+from pchem_pipeline.frames.camera import FACT_NAMES, Stated, facts_from_names, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
@@ -124,7 +124,7 @@ class Hdf5Reader(ContiguousReader):
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         groups = [dataset.parent, *(detectors if len(detectors) == 1 else [])]
-        self.take_facts(_stated_facts(dataset, groups))
+        self.take_facts(*_stated_facts(dataset, groups))
 
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         with _LOCK, opened(self.paths[0]) as file:
@@ -230,7 +230,7 @@ def _is_detector(group: Any) -> bool:
     return text_of(group.attrs.get("NX_class")) == "NXdetector"
 
 
-def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
+def _stated_facts(dataset: Any, groups: list[Any]) -> Stated:
     """Return what the attributes of the dataset say, else values (count_time in NeXus) in some groups.
 
     These are that of the dataset, and the detector where the frames are in NXdata by a link.

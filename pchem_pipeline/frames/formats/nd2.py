@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, require
-from pchem_pipeline.frames.camera import CameraFacts, StatedFacts, bits_of, duration_of, text_of
+from pchem_pipeline.frames.camera import CameraFacts, bits_of, duration_of, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import check_coded
 from pchem_pipeline.frames.reader import changed
@@ -44,11 +44,9 @@ class Nd2Reader(ContiguousReader):
         camera = re.match(r"([^\r\n,]+)(?:, *SN: *([\w-]+))?", words)
         exposure = re.search(r"Exposure: *([\d.]+ *\w+)", words)
         self.take_facts(
-            StatedFacts(
-                CameraFacts(text_of(camera[1]), text_of(camera[2])) if camera else CameraFacts(),
-                duration_of("Exposure", exposure[1]) if exposure else None,
-                bits_of(about.bitsPerComponentSignificant),
-            )
+            CameraFacts(text_of(camera[1]), text_of(camera[2])) if camera else CameraFacts(),
+            duration_of("Exposure", exposure[1]) if exposure else None,
+            bits_of(about.bitsPerComponentSignificant),
         )
         if about.compressionType == "lossy":
             self.notes += ("lossy compression; noise and histograms are altered",)

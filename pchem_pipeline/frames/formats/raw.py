@@ -119,7 +119,7 @@ class RawReader(ContiguousReader):
             missing = " and ".join(f"input.{name}" for name in ("shape", "dtype") if facts[name] is None)
             raise InputError(f"raw frames need {missing}; set this, or write a sidecar {path.name}.json")
         self.bit_shift = facts["bit_shift"] or 0
-        self.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
+        self.take_facts(*facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
         self._lay_out(path, facts)
 
     def _lay_out(self, path: Path, facts: dict[str, Any]) -> None:

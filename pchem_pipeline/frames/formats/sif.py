@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError, require
-from pchem_pipeline.frames.camera import CameraFacts, StatedFacts, celsius, duration_of, text_of, texts_of
+from pchem_pipeline.frames.camera import CameraFacts, celsius, duration_of, text_of, texts_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -59,7 +59,7 @@ class SifReader(ContiguousReader):
             taken=taken if taken > 0 else None,
             setup=texts_of(setup, setup),
         )
-        self.take_facts(StatedFacts(camera, duration_of("ExposureTime", info["ExposureTime"], "s")))
+        self.take_facts(camera, duration_of("ExposureTime", info["ExposureTime"], "s"))
         if (sums := info["AccumulatedCycles"]) > 1:
             self.notes = (f"each frame is the sum of {sums} exposures",)
         ticks = np.array([info[f"timestamp_of_{t}"] for t in range(len(offsets))], np.int64)  # us

@@ -17,7 +17,7 @@ import numpy as np
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
-    StatedFacts,
+    Stated,
     bits_of,
     celsius,
     duration_of,
@@ -78,9 +78,9 @@ class SpeReader(ContiguousReader):
         self.set_layout(Layout(offsets, rows, columns, stored, offset))
         if footer is None:
             duration = duration_of("exp_sec", field["seconds"], "s")
-            self.take_facts(StatedFacts(CameraFacts(temperature=celsius(field["temperature"])), duration))
+            self.take_facts(CameraFacts(temperature=celsius(field["temperature"])), duration)
         else:
-            self.take_facts(_stated_facts(footer))
+            self.take_facts(*_stated_facts(footer))
             self._read_stamps(footer)
 
     def _read_stamps(self, footer: Any) -> None:
@@ -121,14 +121,14 @@ def _footer(path: Path, start: int, size: int) -> Any:
     return ElementTree.fromstring(text)
 
 
-def _stated_facts(footer: Any) -> StatedFacts:
+def _stated_facts(footer: Any) -> Stated:
     """Return what the footer says of the camera and its setting."""
     nothing = ElementTree.Element("none")
     camera, origin = (next(footer.iterfind(f".//{{*}}{name}"), nothing) for name in ("Camera", "Origin"))
     names = {"gain": "AnalogGain", "readout_mode": "Quality"}
     setup = {ours: footer.findtext(f".//{{*}}Adc//{{*}}{name}") for ours, name in names.items()}
     depth = footer.findtext(".//{*}Adc//{*}BitDepth") or ""
-    return StatedFacts(
+    return (
         CameraFacts(
             text_of(camera.get("model")),
             text_of(camera.get("serialNumber")),

@@ -85,7 +85,7 @@ class TiffReader(ContiguousReader):
                 self.set_layout(Layout(offsets, rows, columns, stored, offset))
             else:
                 self._set_coded(pages, offset)
-            self.take_facts(stated_facts(file, first))
+            self.take_facts(*stated_facts(file, first))
             self.active = active_area(first)
 
     def _set_coded(self, pages: Sequence[Any], offset: int | None) -> None:

@@ -14,7 +14,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
     Duration,
-    StatedFacts,
+    Stated,
     agreed_duration,
     bits_of,
     celsius,
@@ -122,15 +122,15 @@ def stated_channels(file: Any) -> tuple[int, int]:
     return sizes[0], math.prod(sizes)
 
 
-def stated_facts(file: Any, page: Any) -> StatedFacts:
+def stated_facts(file: Any, page: Any) -> Stated:
     """Return what our own JSON, OME-XML, Micro-Manager or tags say of frames that are like a page."""
     head = file.pages[0]
-    own = facts_from_names(_shaped(file))
+    own_camera, own_duration, own_depth = facts_from_names(_shaped(file))
     record = _tag(head, _MICRO_MANAGER_TAG)
     record = record if isinstance(record, dict) else {}
     hot = next((value for name, value in record.items() if name.endswith("Temperature")), None)
     cameras = (
-        own.camera,
+        own_camera,
         _ome_camera(_ome(file)),
         CameraFacts(
             text_of(record.get("Camera")), temperature=celsius(hot), taken=seconds_of(record.get("Time"))
@@ -138,7 +138,7 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         CameraFacts(_make_and_model(head), taken=seconds_of(_tag(head, _DATE_TAG))),
     )
     times = (
-        own.duration,
+        own_duration,
         _ome_time(_ome(file)),
         _ratio(_tag(head, _EXPOSURE_TAG)),
         _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(head, _EXIF_TAG), dict) else None,
@@ -147,10 +147,10 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
     bits = page.bitspersample  # which say nothing where they are those of a whole type
     significant = re.search(r'SignificantBits="(\d+)"', _ome(file))
     stated = bits_of(int(significant[1])) if significant else None
-    depths = (stated, own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
+    depths = (stated, own_depth, None if bits in (8, 16, 32) else bits_of(bits))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
-    return StatedFacts(camera, agreed_duration(times), first_of(depths))
+    return camera, agreed_duration(times), first_of(depths)
 
 
 def mosaic(page: Any) -> str:

@@ -84,7 +84,7 @@ class ZarrReader(ContiguousReader):
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(self.shape, piece, self.dtype.itemsize, file_size(path))
-        self.take_facts(facts_from_names(attributes))
+        self.take_facts(*facts_from_names(attributes))
         self.notes = (*channel_notes(_channels(node, self._full), self.shape[0]),)
         missing = _check_chunks(path / self._name, array, parts)
         self.notes += missing
