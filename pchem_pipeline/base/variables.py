@@ -72,8 +72,8 @@ class Variable:
 #: Values of pixels that no tile was done for, where they are not 0: a fit that was not made, and no value.
 _FILLS = {"fit/fit_status": 16384, "maps/quality": 2}
 
-#: Unit, sentence, symbol and its mathtext of each parameter, in the order of tables; what people call it is the
-#: sentence up to a sign.
+#: Unit, sentence, symbol and its mathtext of each parameter, in the order of tables; what people call it is
+#: the sentence up to a sign.
 PARAMETER_WORDS = {
     "quanta_exposure": ("e-", "quanta exposure: mean number of electrons per frame", "H", r"$H$"),
     "charge_rate": ("e-/px/s", "charge rate: quanta exposure / integration time", "H/t", r"$H/t$"),

@@ -27,7 +27,7 @@ from pchem_pipeline.frames.formats.kinds import check_samples
 from pchem_pipeline.frames.formats.packing import PACKINGS
 from pchem_pipeline.frames.settings import InputSettings, PackingName
 from pchem_pipeline.frames.writing import StackFacts
-from pchem_pipeline.store.files import whole_file
+from pchem_pipeline.store.files import write_atomic
 
 #: suffixes of descriptions beside raw files
 SIDECARS = (".json", ".yaml", ".yml", ".inf")
@@ -184,5 +184,4 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
     write_plain(path, b"", blocks, stack.dtype.newbyteorder("<"))
     record: dict[str, Any] = {"shape": stack.shape, "dtype": stack.dtype.name}
     record |= {"byte_order": "little", "header_bytes": 0, **stack.stated}
-    with whole_file(path.with_name(path.name + ".json")) as part:
-        part.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    write_atomic(path.with_name(path.name + ".json"), (json.dumps(record) + "\n").encode())

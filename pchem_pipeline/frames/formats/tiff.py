@@ -27,7 +27,6 @@ from pchem_pipeline.frames.formats.contiguous import (
 )
 from pchem_pipeline.frames.formats.kinds import channel_notes, check_coded, check_samples, mosaic_note
 from pchem_pipeline.frames.formats.tiff_facts import (
-    LINEARIZATION_TAG,
     active_area,
     check_chain,
     images_behind_one_page,
@@ -159,7 +158,7 @@ def _value_notes(pages: Sequence[Any]) -> list[str]:
     notes += unwritten_notes(counts.count(0), len(counts), "strips or tiles")
     if pattern := mosaic(pages[0]):
         notes.append(mosaic_note(pattern))
-    if LINEARIZATION_TAG in pages[0].tags:
+    if "LinearizationTable" in pages[0].tags:
         notes.append(
             "its samples are codes of a table (LinearizationTable), not proportional to light; read as stored"
         )
