@@ -36,8 +36,6 @@ FACT_NAMES = (
     *(*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS, *_DURATIONS_IN, *_SETUP),
     *(name + suffix for name in (*_DURATIONS, *_TEMPERATURES) for suffix in _UNIT_SUFFIXES),
 )
-#: share by which two statements of one time may differ, printed with few digits
-_ROUNDING = 0.01
 #: seconds -> words for the unit; plurals, long ones and ms also count within a sentence
 _UNITS = {
     1.0: "s sec secs second seconds",
@@ -220,7 +218,7 @@ def agreed_duration(found: Iterable[Duration | None]) -> Duration | None:
         return stated[0] if stated else None
     seconds, words = known[0]
     for other, other_words in known[1:]:
-        if abs(other - seconds) > _ROUNDING * seconds:
+        if abs(other - seconds) > 0.01 * seconds:  # times may be printed with few digits
             return Duration(None, f"{words}, but {other_words}")
     return Duration(seconds, words)
 

@@ -63,7 +63,6 @@ _VERSION = 5
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
-_BLOCK_SAMPLES = 1 << 26
 #: Frames from which the scene, or the variances of the offsets in the overscan, are estimated.
 _SCENE_FRAMES = 256
 #: Share of the samples at a limit of the ADC beyond which offsets are not known: with 6 % of them the stated
@@ -179,7 +178,7 @@ def _make_job(
         )
     depth, *_ = _chunks(frames.shape)
     if wanted.format != "zarr":  # files are written by blocks of whole frames
-        depth = max(1, min(depth, _BLOCK_SAMPLES // (frames.shape[1] * frames.shape[2])))
+        depth = max(1, min(depth, (1 << 26) // (frames.shape[1] * frames.shape[2])))
     job = Job(
         target.store,
         frames,

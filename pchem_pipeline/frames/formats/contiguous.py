@@ -26,10 +26,7 @@ from pchem_pipeline.frames.reader import FrameReader, changed, check_window, sou
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
-_MOST_BYTES = 1 << 30
 _MOST_FRAMES = 1 << 26
-#: of a float of 32 bits that is exact
-_LARGEST_WHOLE = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -128,7 +125,7 @@ class OpenedFile:
         done = 0
         while done < len(target):
             try:
-                count = os.preadv(self._handle, [target[done : done + _MOST_BYTES]], offset + done)
+                count = os.preadv(self._handle, [target[done : done + (1 << 30)]], offset + done)
             except OSError as error:
                 raise InputError(f"read error ({error.strerror}); check the disk") from error
             if count == 0:
@@ -256,7 +253,8 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None) -> 
         buffer.byteswap(inplace=True)
     if stored.kind == "f":
         values = buffer.view(f"f{stored.itemsize}")
-        whole = (values >= 0) & (values <= _LARGEST_WHOLE) & (values == np.floor(values))
+        # larger ones are not exact
+        whole = (values >= 0) & (values <= 1 << 24) & (values == np.floor(values))
         if not whole.all():
             raise InputError(
                 f"samples such as {values[~whole][0]:g}, raw whole numbers are needed; record them without a "

@@ -49,9 +49,6 @@ from pchem_pipeline.frames.settings import Area, InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "INTTIME", "ITIME")
-#: of these the first counts where the others are absent: with dead time, or without it
-_TOTAL_TIME_KEYWORDS = ("TELAPSE", "XPOSURE")
-_DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
 _SETUP_KEYWORDS = ("GAIN", "OFFSET", "READMODE", "READOUTM", "XBINNING", "YBINNING", "IMAGETYP")
@@ -129,9 +126,9 @@ class FitsReader(ContiguousReader):
             header = next((each for each in last if name in each), None)  # the image's own before the primary
             return header and duration_of(name, header[name], *units, comment=str(header.comments[name]))
 
-        duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(
-            map(time_of, _TOTAL_TIME_KEYWORDS)
-        )
+        # with dead time, or without it
+        whole = map(time_of, ("TELAPSE", "XPOSURE"))
+        duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(whole)
 
         def area_of(names: Sequence[str]) -> Area | None:
             sections = (header[name] for name in names for header in last if name in header)
@@ -139,7 +136,7 @@ class FitsReader(ContiguousReader):
             return found
 
         self.active, self.overscan = area_of(_ACTIVE_KEYWORDS), area_of(_OVERSCAN_KEYWORDS)
-        depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
+        depths = (bits_of(header.get(name)) for header in last for name in ("BITDEPTH", "ADCBITS"))
         self.take_facts(_camera(last), duration, first_of(depths))
 
     def cards(self) -> tuple[Any, ...]:

@@ -38,8 +38,6 @@ _NAMES_IN_INF = {
     "gain": "EMCCD Gain",
     "binning": "binning",
 }
-#: keys that only samples without packing have
-_UNPACKED = ("dtype", "offset", "byte_order")
 #: factor between the steps of samples from frame to frame by which another packing is told
 _CLEARLY = 4
 
@@ -108,7 +106,7 @@ class RawReader(ContiguousReader):
         facts = {name: getattr(settings, name, None) for name in _Sidecar.model_fields}
         facts = {name: getattr(side, name) if value is None else value for name, value in facts.items()}
         if facts["packing"] is not None:
-            if extra := [name for name in _UNPACKED if facts[name] is not None]:
+            if extra := [name for name in ("dtype", "offset", "byte_order") if facts[name] is not None]:
                 raise InputError(
                     f"packing {facts['packing']} says what the samples are; remove {' and '.join(extra)} "
                     "from the section input or the sidecar"

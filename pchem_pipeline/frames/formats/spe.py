@@ -28,7 +28,7 @@ from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, O
 from pchem_pipeline.frames.formats.kinds import check_samples
 from pchem_pipeline.frames.settings import InputSettings
 
-_HEADER_BYTES, _LARGEST_FOOTER = 4100, 1 << 26
+_HEADER_BYTES = 4100
 #: place of a number of the header, and its type
 _FIELDS = {
     "seconds": (10, "<f"),
@@ -111,7 +111,7 @@ class SpeReader(ContiguousReader):
 
 def _footer(path: Path, start: int, size: int) -> Any:
     """Return the root of the XML behind the frames."""
-    if not _HEADER_BYTES <= start < size or size - start > _LARGEST_FOOTER:
+    if not _HEADER_BYTES <= start < size or size - start > 1 << 26:
         raise InputError("truncated before its footer, or a damaged header; copy the file again")
     with path.open("rb") as stream:
         stream.seek(start)

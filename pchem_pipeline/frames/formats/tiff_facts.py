@@ -29,8 +29,8 @@ from pchem_pipeline.frames.settings import Area
 #: tags of a directory, as in tifffile
 _MOST_TAGS = 4096
 _MOST_PAGES = 100_000
-#: colours of a mosaic by their numbers; most pixels of its pattern
-_COLOURS, _LARGEST_MOSAIC = "RGBCMYW", 36
+#: colours of a mosaic by their numbers
+_COLOURS = "RGBCMYW"
 
 
 def check_chain(path: Path, size: int) -> None:
@@ -152,7 +152,7 @@ def mosaic(page: Any) -> str:
     """Return the colours of a mosaic from left to right and top to bottom; empty where there is none."""
     if getattr(page.photometric, "name", "") != "CFA":
         return ""
-    pattern = bytes(_tag(page, "CFAPattern") or b"")[:_LARGEST_MOSAIC]
+    pattern = bytes(_tag(page, "CFAPattern") or b"")[:36]
     return "".join(_COLOURS[each] for each in pattern if each < len(_COLOURS)) or "CFA"
 
 
