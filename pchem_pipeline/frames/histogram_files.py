@@ -118,10 +118,13 @@ def _read(path: Path) -> list[_Channel]:
         raise InputError(f"cannot be read ({error.strerror or error}); check the file") from error
     except csv.Error as error:
         raise InputError(f"no table of numbers ({error}); histograms have columns DN, count") from error
-    names = [path.stem] if len(names) == 1 else [f"{path.stem}:{name}" for name in names]
     channels: list[_Channel] = []
     for name, column in zip(names, columns, strict=True):
-        channels.append(_channel(path, name, dn, column))
+        several = len(names) > 1
+        try:
+            channels.append(_channel(path, f"{path.stem}:{name}" if several else path.stem, dn, column))
+        except InputError as error:
+            raise InputError(f"channel {name}: {error}" if several else str(error)) from error
         if max(each.counts.size for each in channels) * len(channels) > _MOST_BINS_OF_ALL:
             raise InputError(
                 f"its channels span more than {_MOST_BINS_OF_ALL} DN in total; correct the DN column, or "
@@ -211,24 +214,23 @@ def _is_number(text: str) -> bool:
 
 def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _Channel:
     """Check one histogram, and put it on an axis without gaps and empty ends."""
-    where = "" if name == path.stem else f"channel {name.split(':', 1)[1]}: "
-    axis = _integers(where, "DN", dn)
-    values = _integers(where, "count", counts)
+    axis = _integers("DN", dn)
+    values = _integers("count", counts)
     if axis.size == 0:
-        raise InputError(f"{where}no bins; omit it")
+        raise InputError("no bins; omit it")
     if (values < 0).any():
-        raise InputError(f"{where}negative counts (first at DN {axis[values < 0][0]}); counts are 0 or more")
+        raise InputError(f"negative counts (first at DN {axis[values < 0][0]}); counts are 0 or more")
     steps = np.diff(axis)
     if (steps == 0).any():
-        raise InputError(f"{where}DN {axis[:-1][steps == 0][0]} occurs twice; add up its counts")
+        raise InputError(f"DN {axis[:-1][steps == 0][0]} occurs twice; add up its counts")
     if (steps < 0).any():
-        raise InputError(f"{where}DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
+        raise InputError(f"DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
     if not values.any():
-        raise InputError(f"{where}all counts are zero; omit it")
+        raise InputError("all counts are zero; omit it")
     first, last = np.flatnonzero(values)[[0, -1]]
     low, high = int(axis[first]), int(axis[last])
     if high - low >= _MOST_BINS or not -(2**31) <= low <= high < 2**31:
-        raise InputError(f"{where}DN from {low} to {high}, more than any ADC; correct the DN column")
+        raise InputError(f"DN from {low} to {high}, more than any ADC; correct the DN column")
     full = np.zeros(high - low + 1, np.int64)
     full[axis[first : last + 1] - low] = values[first : last + 1]
     missing = full.size - (last - first + 1)
@@ -236,21 +238,19 @@ def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _
     return _Channel(name, low, full, notes)
 
 
-def _integers(where: str, what: str, values: NDArray[Any]) -> IntArray:
+def _integers(what: str, values: NDArray[Any]) -> IntArray:
     """Return values as integers; refuse NaN, fractions and other types."""
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
-        raise InputError(f"{where}{what} column of type {array.dtype}; numbers are needed")
+        raise InputError(f"{what} column of type {array.dtype}; numbers are needed")
     if array.dtype.kind == "f":
         if not np.isfinite(array).all():
-            raise InputError(f"{where}{what} column has NaN or infinity; correct it")
+            raise InputError(f"{what} column has NaN or infinity; correct it")
         broken = array != np.rint(array)
         if broken.any():
-            raise InputError(
-                f"{where}{what} {array[broken][0]} is not a whole number; give raw DN and raw counts"
-            )
+            raise InputError(f"{what} {array[broken][0]} is not a whole number; give raw DN and raw counts")
         if (np.abs(array) >= 2.0**53).any():
-            raise InputError(f"{where}{what} column has numbers too large to be exact; correct it")
+            raise InputError(f"{what} column has numbers too large to be exact; correct it")
     elif array.size and int(array.max()) > np.iinfo(np.int64).max:
-        raise InputError(f"{where}{what} column has numbers above 2**63; correct it")
+        raise InputError(f"{what} column has numbers above 2**63; correct it")
     return array.astype(np.int64)
