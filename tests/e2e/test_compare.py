@@ -38,11 +38,12 @@ def copies(shell, finished):
     return RunStore.open(shell.folder / "b.zarr", writable=True)
 
 
-def here(shell, *names, **options):
+def here(shell, *names, quiet=False, **options):
     """Compare in this process: the lines that are printed."""
     lines, paths = [], [shell.folder / name for name in names]
     with contextlib.suppress(ChangedError):
-        compare_runs(paths, shell.folder / "compare", Command(progress="off"), write=lines.append, **options)
+        command = Command(progress="off", quiet=quiet)
+        compare_runs(paths, shell.folder / "compare", command, write=lines.append, **options)
     return lines
 
 
