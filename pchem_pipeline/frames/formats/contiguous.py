@@ -193,6 +193,8 @@ class ContiguousReader(FrameReader):
         layout, path = self.layout, self.paths[0]
         if layout is None:
             try:
+                if not path.is_dir() and path.stat().st_size != self.size:
+                    raise changed("the size of the file changed")
                 self._decode_into(buffer, t0, t1, y0, y1)
             except FileNotFoundError as error:
                 raise changed("the file disappeared") from error

@@ -43,7 +43,6 @@ from pchem_pipeline.frames.formats.kinds import (
     mosaic_note,
     windows,
 )
-from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.registry import check_unpacked
 from pchem_pipeline.frames.settings import Area, InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -156,10 +155,7 @@ class FitsReader(ContiguousReader):
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         from astropy.io import fits
 
-        path = self.paths[0]
-        if path.stat().st_size != self.size:
-            raise changed("the size of the file changed")
-        with _LOCK, fits.open(path, memmap=False) as hdus:
+        with _LOCK, fits.open(self.paths[0], memmap=False) as hdus:
             if len(self._numbers) == 1:
                 for part, window in windows(buffer, self._full, t0, y0):
                     part[...] = hdus[self._numbers[0]].section[window]

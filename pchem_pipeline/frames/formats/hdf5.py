@@ -40,7 +40,7 @@ from pchem_pipeline.frames.formats.kinds import (
     n_pieces,
     windows,
 )
-from pchem_pipeline.frames.reader import changed, unwritten_notes
+from pchem_pipeline.frames.reader import unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -129,8 +129,6 @@ class Hdf5Reader(ContiguousReader):
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         with _LOCK, opened(self.paths[0]) as file:
             dataset = file[self._name]
-            if tuple(dataset.shape) != self._full:
-                raise changed("the shape of the dataset changed")
             for part, window in windows(buffer, self._full, t0, y0):
                 if dataset.dtype == part.dtype:
                     dataset.read_direct(part, window)

@@ -14,7 +14,6 @@ from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.frames.camera import CameraFacts, bits_of, duration_of, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import check_coded
-from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.settings import InputSettings
 
 
@@ -56,9 +55,6 @@ class Nd2Reader(ContiguousReader):
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import nd2
 
-        path = self.paths[0]
-        if path.stat().st_size != self.size:
-            raise changed("the size of the file changed")
-        with nd2.ND2File(path) as file:
+        with nd2.ND2File(self.paths[0]) as file:
             for t, frame in enumerate(buffer, t0):
                 frame[...] = file.read_frame(t).reshape(self.shape[1:])[y0:y1]

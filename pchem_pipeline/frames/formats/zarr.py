@@ -26,7 +26,7 @@ from pchem_pipeline.frames.formats.kinds import (
     windows,
 )
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import changed, unwritten_notes
+from pchem_pipeline.frames.reader import unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
@@ -93,8 +93,6 @@ class ZarrReader(ContiguousReader):
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import zarr
 
-        if not self.paths[0].exists():  # missing chunks would read as the fill value
-            raise changed("the store disappeared")
         node: Any = zarr.open(self.paths[0], mode="r")
         array = node[self._name] if self._name else node
         for part, window in windows(buffer, self._full, t0, y0):
