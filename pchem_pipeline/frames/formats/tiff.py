@@ -18,14 +18,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.contiguous import (
-    ContiguousReader,
-    Layout,
-    OpenedFile,
-    even_offsets,
-    unsigned_type,
-)
-from pchem_pipeline.frames.formats.kinds import channel_notes, check_coded, check_samples, mosaic_note
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, OpenedFile, even_offsets
+from pchem_pipeline.frames.formats.kinds import channel_notes, check_coded, mosaic_note
 from pchem_pipeline.frames.formats.tiff_facts import (
     active_area,
     check_chain,
@@ -71,7 +65,7 @@ class TiffReader(ContiguousReader):
             notes = [f"{reduced} reduced pages (previews) are ignored"] if reduced else []
             first = pages[0]
             _check_pages(pages)
-            offset = check_samples(np.dtype(first.dtype), settings)
+            self.set_stack((len(pages), *first.shape[-2:]), np.dtype(first.dtype), settings, "pages")
             count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
             channels, images = stated_channels(file)
             notes += channel_notes(channels, images if images == count else min(count, channels))
@@ -81,13 +75,13 @@ class TiffReader(ContiguousReader):
             offsets = _contiguous_offsets(file, pages, self.size)
             rows, columns = first.shape[-2:]
             if offsets is not None:
-                self.set_layout(Layout(offsets, rows, columns, stored, offset))
+                self.set_layout(Layout(offsets, rows, columns, stored, self._offset))
             else:
-                self._set_coded(pages, offset)
+                self._set_coded(pages)
             self.take_facts(*stated_facts(file, first))
             self.active = active_area(first)
 
-    def _set_coded(self, pages: Sequence[Any], offset: int | None) -> None:
+    def _set_coded(self, pages: Sequence[Any]) -> None:
         """Remember where the pages are, after a look at where their strips or tiles are."""
         broken = [page for page in pages if _reaches_beyond(page, self.size)]
         if broken:
@@ -95,13 +89,9 @@ class TiffReader(ContiguousReader):
                 f"truncated: {len(broken)} of {len(pages)} pages extend beyond the end of the file "
                 f"({self.size} bytes); copy the file again"
             )
-        rows, columns = pages[0].shape
         piece = max((page.chunks for page in pages), key=math.prod)
-        stored = np.dtype(pages[0].dtype)
-        check_coded((len(pages), rows, columns), piece, stored.itemsize, self.size)
-        self.shape, self.dtype = (len(pages), rows, columns), unsigned_type(stored)
-        self._offset = offset
-        self.rows_per_read = min(rows, max(page.chunks[0] for page in pages))
+        check_coded(self.shape, piece, self.dtype.itemsize, self.size)
+        self.rows_per_read = min(self.shape[1], max(page.chunks[0] for page in pages))
         self._places = np.array([page.offset for page in pages], np.int64)
 
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
