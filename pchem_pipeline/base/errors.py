@@ -128,6 +128,13 @@ class InputError(PchEmError):
     exit_code = ExitCode.INPUT
 
 
+def unreadable(path: Path, error: OSError) -> InputError:
+    """Return the error for a file that the file system does not give."""
+    return InputError(
+        f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions"
+    )
+
+
 class StoreError(PchEmError):
     """The run's store is missing, damaged, unwritable, or of another schema version."""
 

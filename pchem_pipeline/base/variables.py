@@ -72,18 +72,30 @@ class Variable:
 #: Values of pixels that no tile was done for, where they are not 0: a fit that was not made, and no value.
 _FILLS = {"fit/fit_status": 16384, "maps/quality": 2}
 
-_PARAMETER_WORDS = {
-    "quanta_exposure": ("e-", "quanta exposure: mean number of electrons per frame", "H"),
-    "conversion_gain": ("e-/DN", "conversion gain", "g"),
-    "bias": ("DN", "bias: DN at zero electrons", "mu"),
-    "read_noise_dn": ("DN", "read noise, quantisation included", "sigma"),
-    "read_noise_e": ("e-", "read noise, quantisation included", "sigma_e-"),
-    "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R"),
-    "charge_rate": ("e-/px/s", "charge rate: quanta exposure / integration time", "H/t"),
-    "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time, in the dark", "i_d"),
-    "spurious_charge": ("e-", "spurious charge: exposure at integration time 0", "H_0"),
-    "dark_signal": ("e-", "dark signal: quanta exposure at light level 0", "H_0"),
-    "charge_per_level": ("e-/level", "slope of the quanta exposure against the light level", ""),
+#: Unit, sentence, symbol and its mathtext of each parameter, in the order of tables; what people call it is
+#: the sentence up to a sign.
+PARAMETER_WORDS = {
+    "quanta_exposure": ("e-", "quanta exposure: mean number of electrons per frame", "H", r"$H$"),
+    "charge_rate": ("e-/px/s", "charge rate: quanta exposure / integration time", "H/t", r"$H/t$"),
+    "dark_current": (
+        "e-/px/s",
+        "dark current: quanta exposure / integration time, in the dark",
+        "i_d",
+        r"$i_\mathrm{d}$",
+    ),
+    "charge_per_level": (
+        "e-/level",
+        "charge per light level: slope of the quanta exposure",
+        "",
+        r"$\mathrm{d}H/\mathrm{d}\ell$",
+    ),
+    "spurious_charge": ("e-", "spurious charge: exposure at integration time 0", "H_0", r"$H_0$"),
+    "dark_signal": ("e-", "dark signal: quanta exposure at light level 0", "H_0", r"$H_0$"),
+    "conversion_gain": ("e-/DN", "conversion gain", "g", r"$g$"),
+    "bias": ("DN", "bias: DN at zero electrons", "mu", r"$\mu$"),
+    "read_noise_dn": ("DN", "read noise, quantisation included", "sigma", r"$\sigma$"),
+    "read_noise_e": ("e-", "read noise, quantisation included", "sigma_e-", r"$\sigma_{\mathrm{e}^-}$"),
+    "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R", r"$\sigma_R$"),
 }
 
 
@@ -101,7 +113,7 @@ def _table(text: str) -> list[Variable]:
 
 def _parameter(group: str, name: str, words: str = "", suffix: str = "") -> Variable:
     """Return a parameter, or, with a suffix, what the words say of it."""
-    unit, sentence, symbol = _PARAMETER_WORDS[name]
+    unit, sentence, symbol, _ = PARAMETER_WORDS[name]
     symbol = "" if suffix else symbol
     return Variable(f"{group}/{name}{suffix}", ("y", "x"), "float64", unit, words + sentence, symbol)
 

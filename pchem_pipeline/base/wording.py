@@ -7,22 +7,10 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
-#: Symbol (mathtext), words and stored unit of each map.
-_SYMBOLS = {
-    "quanta_exposure": (r"$H$", "quanta exposure", "e-"),
-    "charge_rate": (r"$H/t$", "charge rate", "e-/px/s"),
-    "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
-    "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),
-    "spurious_charge": (r"$H_0$", "spurious charge", "e-"),
-    "dark_signal": (r"$H_0$", "dark signal", "e-"),
-    "conversion_gain": (r"$g$", "conversion gain", "e-/DN"),
-    "bias": (r"$\mu$", "bias", "DN"),
-    "read_noise_dn": (r"$\sigma$", "read noise", "DN"),
-    "read_noise_e": (r"$\sigma_{\mathrm{e}^-}$", "read noise", "e-"),
-    "analog_read_noise_e": (r"$\sigma_R$", "analog read noise", "e-"),
-}
+from pchem_pipeline.base.variables import PARAMETER_WORDS
+
 #: All maps in the order of tables.
-MAPS = tuple(_SYMBOLS)
+MAPS = tuple(PARAMETER_WORDS)
 
 #: Digits and signs to their superscripts.
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -80,8 +68,8 @@ def symbol(name: str) -> tuple[str, str, str]:
     Raises:
         KeyError: if no such map exists.
     """
-    math_symbol, words, unit = _SYMBOLS[name]
-    return math_symbol, words, unit_text(unit)
+    unit, sentence, _, math_symbol = PARAMETER_WORDS[name]
+    return math_symbol, re.split("[:,]", sentence)[0], unit_text(unit)
 
 
 def heading(name: str) -> str:
@@ -92,7 +80,7 @@ def heading(name: str) -> str:
 
 def stored_unit(name: str) -> str:
     """Return the unit of a map as the store writes it."""
-    return _SYMBOLS[name][2]
+    return PARAMETER_WORDS[name][0]
 
 
 def short(value: float, digits: int = 3) -> str:

@@ -25,11 +25,10 @@ from pchem_pipeline.cli.commands import apply, methods, plan, twin
 from pchem_pipeline.cli.help import PlainCommand, PlainGroup
 from pchem_pipeline.cli.options import (
     Output,
-    Progress,
-    Quiet,
     Strict,
     Target,
     on_this_machine,
+    only_reads,
     region_of,
     say,
     takes_command,
@@ -56,6 +55,7 @@ def _command(heading: str, name: str | None = None) -> Callable[[Callable[..., N
 
 
 @_command("Run")
+@takes_command(without=("force", "dry_run", "roi"))
 def demo(
     output: Output = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
@@ -68,7 +68,8 @@ def demo(
             "part of the sensor or run"
         ),
     ] = None,
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Run all stages on a small simulated sensor.
 
@@ -76,7 +77,7 @@ def demo(
     """
     from pchem_pipeline.commands.demo import run_demo
 
-    say(run_demo(output, size=size, n_frames=frames, seed=seed, hidden=hidden, quiet=quiet))
+    say(run_demo(output, command, size=size, n_frames=frames, seed=seed, hidden=hidden))
 
 
 @_command("Run")
@@ -267,6 +268,7 @@ def view(
 
 
 @_command("Look at results")
+@only_reads
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
     output: Output = Path("compare"),
@@ -290,8 +292,8 @@ def compare(
             "section compare of the reference; none there: any significant change]",
         ),
     ] = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Compare runs and write their history.
 
@@ -303,12 +305,11 @@ def compare(
     compare_runs(
         runs,
         output,
+        command,
         tolerance=tolerance,
         labels=label or (),
         rate=fdr,
         limits=limit or (),
-        progress=progress,
-        quiet=quiet,
         write=say,
     )
 
@@ -318,6 +319,7 @@ _command("Use results")(apply)
 
 
 @_command("Use results")
+@only_reads
 def export(
     target: Target,
     output: Output = Path("export"),
@@ -330,15 +332,18 @@ def export(
             "smap, banzai, pyxel, getframes",
         ),
     ] = "fits,csv",
+    *,
+    command: Command,
 ) -> None:
     """Write maps, tables and files for other programs."""
     from pchem_pipeline.commands.export import export_run
 
-    for path in export_run(target, output, _listed(formats.lower(), "--format")):
+    for path in export_run(target, output, _listed(formats.lower(), "--format"), command.reporter()):
         typer.echo(path)
 
 
 @_command("Use results")
+@only_reads
 def figures(
     target: Target,
     output: Output = Path("figures"),
@@ -353,7 +358,8 @@ def figures(
     style: Annotated[
         str, typer.Option(help="style sheet of matplotlib (fonts, sizes, lines): a name or a file")
     ] = "",
-    progress: Progress = "auto",
+    *,
+    command: Command,
 ) -> None:
     """Write figures for a paper, with their numbers as CSV."""
     from pchem_pipeline.commands.figures import figures_of_run
@@ -361,12 +367,12 @@ def figures(
     for path in figures_of_run(
         target,
         output,
+        command.reporter(),
         formats=_listed(formats, "--format"),
         width=width,
         only=_listed(only, "--only"),
         dpi=dpi,
         style=style,
-        progress=progress,
     ):
         typer.echo(path)
 

@@ -26,7 +26,14 @@ def apply(
         ),
     ],
     frames: Annotated[list[str], typer.Argument(help="camera files, globs or folders of the same sensor")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="store, or folder of files, to write")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="store, or folder of files, to write [default: calibrated.zarr, or calibrated]",
+        ),
+    ] = None,
     what: Annotated[
         str, typer.Option(help="electrons, numbers, exposure, separated by commas, or all")
     ] = "all",
@@ -71,6 +78,7 @@ def apply(
     target, why = run_for(target, frames, max_age)
     if why:
         typer.echo(f"apply: calibrated with {target}, {why}", err=True)
+    output = output or Path("calibrated.zarr" if format == "zarr" else "calibrated")
     wanted = ApplySettings(kinds_of(what), prior, reference, format, dataset)
     for path in apply_to_frames(find_run(target), frames, output, wanted, replace(command, force=force)):
         typer.echo(path)
@@ -83,7 +91,7 @@ def twin(
         typer.Option(
             "--output", "-o", help="YAML file to write; maps are written beside it", callback=on_this_machine
         ),
-    ],
+    ] = Path("camera.yaml"),
     scene: Annotated[
         str | None,
         typer.Option(

@@ -31,10 +31,8 @@ def on_this_machine(path: Path | None) -> Path | None:
 _common = functools.partial(typer.Option, rich_help_panel="Common options")
 
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
-Progress = Annotated[Literal["auto", "on", "off"], _common(help="progress bars; auto: only on a terminal")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="folder to write to", callback=on_this_machine)]
 Strict = Annotated[bool, typer.Option("--strict", help="exit code 3 if the results are not reliable")]
-Quiet = Annotated[bool, _common("--quiet", "-q", help="warnings and errors only")]
 
 
 def _common_options(
@@ -61,8 +59,10 @@ def _common_options(
     log_json: Annotated[
         Path | None, _common(help="append events as JSON lines to this file", callback=on_this_machine)
     ] = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    progress: Annotated[
+        Literal["auto", "on", "off"], _common(help="progress bars; auto: only on a terminal")
+    ] = "auto",
+    quiet: Annotated[bool, _common("--quiet", "-q", help="warnings and errors only")] = False,
 ) -> None:
     """Declare the common options, in the order of ``--help``; it is never called."""
 
@@ -137,6 +137,10 @@ def takes_command(
         return wrapper
 
     return decorate
+
+
+#: Of a command that only reads runs: the options of what it says.
+only_reads = takes_command(without=("force", "dry_run", "roi", "workers", "backend", "max_memory"))
 
 
 def _settings_of_input(options: dict[str, Any]) -> dict[str, Any]:

@@ -30,8 +30,6 @@ from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.files import whole_file, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-_NO_WEIGHT = 1e8  # e-^2: the variance by which PYME leaves a pixel out
-
 
 @dataclass(frozen=True)
 class Calibration:
@@ -87,7 +85,8 @@ class Calibration:
     @property
     def variance(self) -> FloatArray:
         """Of a pixel without light, e-^2; so large that it does not count where a pixel has no fit."""
-        return np.where(self.fitted, self.read_noise**2 + self.electrons, _NO_WEIGHT)
+        # PYME leaves a pixel out by it
+        return np.where(self.fitted, self.read_noise**2 + self.electrons, 1e8)
 
     @property
     def dark_rate(self) -> FloatArray:

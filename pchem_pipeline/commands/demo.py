@@ -29,7 +29,7 @@ from pchem_pipeline.store.run_store import RunStore
 
 
 def run_demo(
-    output: Path, *, size: int, n_frames: int, seed: int, hidden: str | None = None, quiet: bool = False
+    output: Path, command: Command, *, size: int, n_frames: int, seed: int, hidden: str | None = None
 ) -> str:
     """Simulate a sensor of ``size`` x ``size`` pixels to TIFF, run every stage, and return a text.
 
@@ -53,7 +53,7 @@ def run_demo(
         {"run": {"store": "demo.zarr", "title": "Simulated demo sensor", "tile": 32}, "simulate": simulate}
     )
     write_config(path, dump_config(config))
-    target, command = find_run(path), Command(quiet=quiet)
+    target = find_run(path)
     run_stages(target, pipeline_of(target.config), command)
     table = _comparison_table(RunStore.open(target.store))
     if effect is not None:

@@ -9,7 +9,6 @@ from pchem_pipeline.base.wording import measured, symbol
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
 from pchem_pipeline.report.pages.summary import KEY_MAPS
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
@@ -41,7 +40,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if add:
         target, words = adopt_verdict(target)
         if words:
-            Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words)
+            command.reporter().info(words)
     if refit:
         done = {s.stage for s in run_status(target) if s.state != "missing"}
         stages = [name for name in ("fit", "maps", "ensemble", "report") if name in done]

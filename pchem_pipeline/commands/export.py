@@ -18,6 +18,7 @@ from pchem_pipeline.model.fit.status import MEANINGS, words_of
 from pchem_pipeline.model.maps.defects import OPEN, Defect, Defects
 from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
 from pchem_pipeline.report.pages.emva import emva_rows
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.stages.report.stored import samples_of
@@ -42,7 +43,7 @@ _COLUMNS = (
 )
 
 
-def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
+def export_run(path: Path, folder: Path, formats: Sequence[str], reporter: Reporter) -> list[Path]:
     """Write the maps of a run, given by its store or YAML, in any of ``FORMATS``; return the files.
 
     Raises:
@@ -52,7 +53,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     check_formats(formats, FORMATS, "written")
     target = find_run(path)
     store = with_maps(target.stored())
-    warn_if_old(target, ("maps",), "written in this state")
+    warn_if_old(target, ("maps",), "written in this state", reporter)
     written: list[Path] = []
     images = _images(store) if set(formats) & set(_IMAGES) else []
     for name in dict.fromkeys(formats):

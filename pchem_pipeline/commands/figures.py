@@ -11,7 +11,7 @@ from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure, csv_text
-from pchem_pipeline.run.progress import ProgressMode, Reporter
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.report import gather
@@ -60,13 +60,13 @@ def gather_run(target: Target) -> ReportData:
 def figures_of_run(
     path: Path,
     folder: Path,
+    reporter: Reporter,
     *,
     formats: Sequence[str] = ("pdf",),
     width: str | None = None,
     only: Sequence[str] = (),
     dpi: int = 600,
     style: str = "",
-    progress: ProgressMode = "auto",
 ) -> list[Path]:
     """Write the figures of a run, given by its store or YAML, and their numbers; return the files.
 
@@ -82,9 +82,9 @@ def figures_of_run(
     width_mm = None if width is None else millimetres(width)
     target = find_run(path)
     data = gather_run(target)
-    warn_if_old(target, ("maps", "ensemble"), "drawn in this state")
+    warn_if_old(target, ("maps", "ensemble"), "drawn in this state", reporter)
     chosen, written = _chosen(run_figures(data), only), []
-    with Reporter(progress).progress("figures", len(chosen), "figure") as advance:
+    with reporter.progress("figures", len(chosen), "figure") as advance:
         for figure in chosen:
             look = Look(width_mm or figure.width_mm, dpi=dpi, style=style)
             for name, content in paper_files(figure, tuple(dict.fromkeys(formats)), look).items():
@@ -114,8 +114,8 @@ def _chosen(found: list[Figure], only: Sequence[str]) -> list[Figure]:
     return [figure for figure in found if not only or figure.name in only]
 
 
-def warn_if_old(target: Target, stages: Sequence[str], words: str) -> None:
+def warn_if_old(target: Target, stages: Sequence[str], words: str, reporter: Reporter) -> None:
     """Warn if results of these stages are not up to date."""
     for state in run_status(target):
         if state.stage in stages and state.state != "complete":
-            Reporter("off").warning(f"{state.stage}: {state.words()}; {words}")
+            reporter.warning(f"{state.stage}: {state.words()}; {words}")

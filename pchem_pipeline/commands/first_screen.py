@@ -11,7 +11,6 @@ from typing import Any
 
 from pchem_pipeline.base.errors import IncompleteRunError, NotBelievedError, quoted
 from pchem_pipeline.commands.new_run import first_try
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import run_stages
@@ -61,7 +60,7 @@ def _tell(
     if "report" not in stages or numbers is None:
         say(str(target.store))
         return ""
-    with contextlib.closing(Reporter("off", quiet=command.quiet, log=command.log_json)) as reporter:
+    with contextlib.closing(command.reporter()) as reporter:
         reporter.event("verdict", answers=numbers["answers"], next=numbers["next"])
         if not command.quiet:
             for line in first_screen(numbers, typed(target)):

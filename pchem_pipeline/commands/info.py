@@ -26,8 +26,6 @@ from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.stages.ingest import disk_words
 
-_MOST_CODES_OF = 4_000_000  # samples whose codes are counted
-
 
 def about_program() -> list[str]:
     """Return the version, the formats with their libraries, the effects by tag, and the cache of kernels."""
@@ -74,7 +72,7 @@ def _stack_words(frames: FrameSequence) -> str:
     """Return what the frames of all files are together."""
     n, rows, columns = frames.shape
     some = np.concatenate([frames.read(t, t + 1) for t in sorted({0, n // 2, n - 1})])
-    codes = np.unique(some.ravel()[:: 1 + some.size // _MOST_CODES_OF]).size
+    codes = np.unique(some.ravel()[:: 1 + some.size // 4_000_000]).size
     parts = [f"together {n} frames of {rows} x {columns}", f"DN {some.min()} to {some.max()} ({codes} codes)"]
     parts += [frames.camera.words()] if frames.camera.words() else []
     return ", ".join(parts)

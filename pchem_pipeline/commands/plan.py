@@ -130,9 +130,7 @@ def _plan_lines(
 def _plan_json(plan: Plan, targets: Sequence[Target]) -> dict[str, Any]:
     return {
         "samples": 1,
-        "read_noise_e": plan.point.read_noise_e,
-        "quanta_exposure": plan.point.quanta_exposure,
-        "conversion_gain": plan.point.conversion_gain,
+        **vars(plan.point),
         "frames": plan.frames,
         "targets": [
             {"target": str(target), "frames_bound": bound}
@@ -180,9 +178,8 @@ def _split_lines(plan: SamplesPlan, targets: Sequence[Target]) -> list[str]:
 def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
     return {
         "samples": len(plan.split.exposures),
-        "read_noise_e": plan.point.read_noise_e,
+        **vars(plan.point),
         "quanta_exposure": list(plan.split.exposures),
-        "conversion_gain": plan.point.conversion_gain,
         "shares": list(plan.split.shares),
         "frames": plan.frames,
         "frames_per_sample": list(plan.per_sample),

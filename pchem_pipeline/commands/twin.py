@@ -34,8 +34,6 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
     store = target.stored()
     check_run(store)
     sensor = target.sensor(store)
-    if sensor.kind == "histograms":
-        raise ConfigError(f"{target.store} was made from ready-made histograms; a run of frames is needed")
     calibration = read_calibration(store)
     usable = calibration.usable & (calibration.quanta_exposure >= 0.0)
     if not usable.any():

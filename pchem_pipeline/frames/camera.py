@@ -36,8 +36,6 @@ FACT_NAMES = (
     *(*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS, *_DURATIONS_IN, *_SETUP),
     *(name + suffix for name in (*_DURATIONS, *_TEMPERATURES) for suffix in _UNIT_SUFFIXES),
 )
-#: share by which two statements of one time may differ, printed with few digits
-_ROUNDING = 0.01
 #: seconds -> words for the unit; plurals, long ones and ms also count within a sentence
 _UNITS = {
     1.0: "s sec secs second seconds",
@@ -115,13 +113,8 @@ class Duration(NamedTuple):
     words: str
 
 
-@dataclass(frozen=True)
-class StatedFacts:
-    """What a file says beside its frames, the bits of the ADC among it; None where it does not."""
-
-    camera: CameraFacts = CameraFacts()
-    duration: Duration | None = None
-    bit_depth: int | None = None
+#: What a file says beside its frames: camera, integration time, bits of the ADC; None where it does not.
+Stated = tuple[CameraFacts, Duration | None, int | None]
 
 
 def text_of(value: Any) -> str | None:
@@ -225,7 +218,7 @@ def agreed_duration(found: Iterable[Duration | None]) -> Duration | None:
         return stated[0] if stated else None
     seconds, words = known[0]
     for other, other_words in known[1:]:
-        if abs(other - seconds) > _ROUNDING * seconds:
+        if abs(other - seconds) > 0.01 * seconds:  # times may be printed with few digits
             return Duration(None, f"{words}, but {other_words}")
     return Duration(seconds, words)
 
@@ -236,7 +229,7 @@ def bits_of(value: Any) -> int | None:
     return int(value) if whole and 1 <= int(value) <= 32 else None
 
 
-def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -> StatedFacts:
+def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -> Stated:
     """Return the facts from values, with their units, under the names that most programs use."""
 
     def units_of(name: str) -> list[Any]:
@@ -263,9 +256,7 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -
         first_of(seconds_of(values.get(name)) for name in _TIMES),
         texts_of(values, _SETUP),
     )
-    return StatedFacts(
-        camera, agreed_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
-    )
+    return camera, agreed_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
 
 
 def first_of(found: Iterable[Any]) -> Any:

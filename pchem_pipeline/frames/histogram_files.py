@@ -88,7 +88,7 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
         try:
             channels += _read(entry.path)
         except InputError as error:
-            entry.problem = str(error).removeprefix(f"{entry.path}: ")
+            entry.problem = str(error)
     report.raise_if_refused(settings.on_bad_file)
     paths = tuple(entry.path for entry in report.good)
     bins = max(channel.counts.size for channel in channels)
@@ -110,24 +110,25 @@ def _read(path: Path) -> list[_Channel]:
     """Read the channels of one file."""
     suffix = path.suffix.lower()
     if suffix not in HISTOGRAM_SUFFIXES:
-        raise InputError(f"{path}: give histograms as .csv, .txt, .npy or .npz")
+        raise InputError("give histograms as .csv, .txt, .npy or .npz")
     read = _read_numpy if suffix in (".npy", ".npz") else _read_text
     try:
         dn, columns, names = read(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
+        raise InputError(f"cannot be read ({error.strerror or error}); check the file") from error
     except csv.Error as error:
-        raise InputError(
-            f"{path}: no table of numbers ({error}); histograms have columns DN, count"
-        ) from error
-    names = [path.stem] if len(names) == 1 else [f"{path.stem}:{name}" for name in names]
+        raise InputError(f"no table of numbers ({error}); histograms have columns DN, count") from error
     channels: list[_Channel] = []
     for name, column in zip(names, columns, strict=True):
-        channels.append(_channel(path, name, dn, column))
+        several = len(names) > 1
+        try:
+            channels.append(_channel(path, f"{path.stem}:{name}" if several else path.stem, dn, column))
+        except InputError as error:
+            raise InputError(f"channel {name}: {error}" if several else str(error)) from error
         if max(each.counts.size for each in channels) * len(channels) > _MOST_BINS_OF_ALL:
             raise InputError(
-                f"{path}: its channels span more than {_MOST_BINS_OF_ALL} DN in total; correct the DN "
-                "column, or give fewer channels"
+                f"its channels span more than {_MOST_BINS_OF_ALL} DN in total; correct the DN column, or "
+                "give fewer channels"
             )
     return channels
 
@@ -140,16 +141,15 @@ def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]
             dn, table = split(path, np.load(stream, allow_pickle=False))
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(
-            f"{path}: not a valid {path.suffix[1:]} file of plain numbers (pickles are never opened); save "
-            "it again"
+            f"not a valid {path.suffix[1:]} file of plain numbers (pickles are never opened); save it again"
         ) from error
     except (OSError, InputError):
         raise
     except Exception as error:  # a damaged zip archive raises its own kind
-        raise InputError(f"{path}: damaged ({error}); copy it again") from error
+        raise InputError(f"damaged ({error}); copy it again") from error
     if dn.ndim != 1 or table.ndim != 2 or table.shape[1] != dn.size:
         raise InputError(
-            f"{path}: shapes dn {dn.shape} and counts {table.shape} do not match; counts is (channels, bins)"
+            f"shapes dn {dn.shape} and counts {table.shape} do not match; counts is (channels, bins)"
         )
     return dn, list(table), [str(i) for i in range(len(table))]
 
@@ -159,10 +159,10 @@ def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     held = set(getattr(archive, "files", ()))
     if not {"dn", "counts"} <= held:
         listed = ", ".join(sorted(held)) or "nothing"
-        raise InputError(f"{path}: needs arrays dn and counts, has {listed}; save it with these names")
+        raise InputError(f"needs arrays dn and counts, has {listed}; save it with these names")
     unpacked = sum(part.file_size for part in archive.zip.infolist())
     if unpacked > max(MOST_PIECE, 100 * path.stat().st_size):
-        raise InputError(f"{path}: {unpacked} bytes unpacked, too large for histograms; save it again")
+        raise InputError(f"{unpacked} bytes unpacked, too large for histograms; save it again")
     return archive["dn"], np.atleast_2d(archive["counts"])
 
 
@@ -171,9 +171,7 @@ def _split_npy(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[A
     if array.ndim == 1:
         return np.arange(array.size), array[None]
     if array.ndim != 2:
-        raise InputError(
-            f"{path}: an array of shape {array.shape}; histograms are (bins, 2) or (channels, bins)"
-        )
+        raise InputError(f"an array of shape {array.shape}; histograms are (bins, 2) or (channels, bins)")
     if array.shape[1] == 2:
         return array[:, 0], array[None, :, 1]
     return np.arange(array.shape[1]), array
@@ -184,10 +182,10 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file; histograms as CSV have columns DN, count") from error
+        raise InputError("not a text file; histograms as CSV have columns DN, count") from error
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
-        raise InputError(f"{path}: no histogram; omit it")
+        raise InputError("no histogram; omit it")
     mark = next((sign for sign in (",", ";", "\t") if sign in lines[0]), " ")
     rows = [
         [cell.strip() for cell in row]
@@ -197,12 +195,10 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
     header = None if _is_number(rows[0][0]) else rows.pop(0)
     width = len(header or rows[0])
     if width < 2:
-        raise InputError(f"{path}: needs two or more columns, DN and count")
+        raise InputError("needs two or more columns, DN and count")
     for number, row in enumerate(rows, 1 + (header is not None)):
         if len(row) != width or not all(_is_number(cell) for cell in row):
-            raise InputError(
-                f"{path}: row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it"
-            )
+            raise InputError(f"row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it")
     table = np.fromiter((float(cell) for row in rows for cell in row), np.float64).reshape(-1, width)
     names = [name or str(i) for i, name in enumerate((header or [""] * width)[1:])]
     return table[:, 0], list(table[:, 1:].T), names
@@ -218,24 +214,23 @@ def _is_number(text: str) -> bool:
 
 def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _Channel:
     """Check one histogram, and put it on an axis without gaps and empty ends."""
-    where = f"{path}: " if name == path.stem else f"{path}: channel {name.split(':', 1)[1]}: "
-    axis = _integers(where, "DN", dn)
-    values = _integers(where, "count", counts)
+    axis = _integers("DN", dn)
+    values = _integers("count", counts)
     if axis.size == 0:
-        raise InputError(f"{where}no bins; omit it")
+        raise InputError("no bins; omit it")
     if (values < 0).any():
-        raise InputError(f"{where}negative counts (first at DN {axis[values < 0][0]}); counts are 0 or more")
+        raise InputError(f"negative counts (first at DN {axis[values < 0][0]}); counts are 0 or more")
     steps = np.diff(axis)
     if (steps == 0).any():
-        raise InputError(f"{where}DN {axis[:-1][steps == 0][0]} occurs twice; add up its counts")
+        raise InputError(f"DN {axis[:-1][steps == 0][0]} occurs twice; add up its counts")
     if (steps < 0).any():
-        raise InputError(f"{where}DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
+        raise InputError(f"DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
     if not values.any():
-        raise InputError(f"{where}all counts are zero; omit it")
+        raise InputError("all counts are zero; omit it")
     first, last = np.flatnonzero(values)[[0, -1]]
     low, high = int(axis[first]), int(axis[last])
     if high - low >= _MOST_BINS or not -(2**31) <= low <= high < 2**31:
-        raise InputError(f"{where}DN from {low} to {high}, more than any ADC; correct the DN column")
+        raise InputError(f"DN from {low} to {high}, more than any ADC; correct the DN column")
     full = np.zeros(high - low + 1, np.int64)
     full[axis[first : last + 1] - low] = values[first : last + 1]
     missing = full.size - (last - first + 1)
@@ -243,21 +238,19 @@ def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _
     return _Channel(name, low, full, notes)
 
 
-def _integers(where: str, what: str, values: NDArray[Any]) -> IntArray:
+def _integers(what: str, values: NDArray[Any]) -> IntArray:
     """Return values as integers; refuse NaN, fractions and other types."""
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
-        raise InputError(f"{where}{what} column of type {array.dtype}; numbers are needed")
+        raise InputError(f"{what} column of type {array.dtype}; numbers are needed")
     if array.dtype.kind == "f":
         if not np.isfinite(array).all():
-            raise InputError(f"{where}{what} column has NaN or infinity; correct it")
+            raise InputError(f"{what} column has NaN or infinity; correct it")
         broken = array != np.rint(array)
         if broken.any():
-            raise InputError(
-                f"{where}{what} {array[broken][0]} is not a whole number; give raw DN and raw counts"
-            )
+            raise InputError(f"{what} {array[broken][0]} is not a whole number; give raw DN and raw counts")
         if (np.abs(array) >= 2.0**53).any():
-            raise InputError(f"{where}{what} column has numbers too large to be exact; correct it")
+            raise InputError(f"{what} column has numbers too large to be exact; correct it")
     elif array.size and int(array.max()) > np.iinfo(np.int64).max:
-        raise InputError(f"{where}{what} column has numbers above 2**63; correct it")
+        raise InputError(f"{what} column has numbers above 2**63; correct it")
     return array.astype(np.int64)

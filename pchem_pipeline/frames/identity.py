@@ -13,7 +13,7 @@ from typing import Any
 
 import xxhash
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import unreadable
 
 #: bytes that a thread reads or decodes at a time: they are still in its cache when they are hashed and copied
 SCRATCH_BYTES = 1 << 20
@@ -56,7 +56,7 @@ class FileHasher:
                     del self._parts[0]
                     self._offset = 0
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise unreadable(self.path, error) from error
 
     def take(self, count: int) -> bytes:
         """Read and hash the next bytes of a file (no folder) and return them, fewer at its end.
@@ -69,7 +69,7 @@ class FileHasher:
                 stream.seek(self._offset)
                 data = stream.read(count)
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise unreadable(self.path, error) from error
         self._add(data)
         return data
 
@@ -99,11 +99,6 @@ class FileHasher:
         self._offset += len(data)
         if self._advance is not None:
             self._advance(len(data))
-
-    def _unreadable(self, error: OSError) -> InputError:
-        return InputError(
-            f"{self.path}: cannot be read ({error.strerror}); check the path and its permissions"
-        )
 
 
 def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:
@@ -136,9 +131,7 @@ def file_size(path: Path) -> int:
     try:
         return sum(part.stat().st_size for part in _parts(path))
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check that it is still there"
-        ) from error
+        raise unreadable(path, error) from error
 
 
 def digest_of(record: object) -> str:

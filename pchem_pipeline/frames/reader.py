@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
-from pchem_pipeline.base.errors import InputError, PchEmError, error_words
-from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
+from pchem_pipeline.base.errors import InputError, PchEmError, error_words, unreadable
+from pchem_pipeline.frames.camera import CameraFacts, Duration
 from pchem_pipeline.frames.settings import Area, InputSettings
 
 
@@ -44,7 +44,7 @@ class FrameReader(ABC):
         overscan: likewise of pixels without electrons; None: all outside of ``active``.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,).
         frame_stamps: number that the camera gave to each frame, (frames,).
-        notes: remarks for the user on what was left out or assumed.
+        notes: remarks for the user on what was left out or assumed, without the file's name.
         byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
         unwritten: samples of the file were never written, and are read as a fill value.
         rows_per_read: rows that are decoded together, so that they come at no more cost than one.
@@ -77,7 +77,7 @@ class FrameReader(ABC):
     @classmethod
     @abstractmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
-        """Open one file; raise InputError with one line (what, where, the cure) if that cannot be."""
+        """Open one file; raise InputError with one line (what, the cure) if that cannot be."""
 
     @classmethod
     def recognises(cls, path: Path, head: bytes) -> bool:
@@ -103,10 +103,12 @@ class FrameReader(ABC):
             self.read_into(buffer, t0, t1, y0, y1)
         return buffer
 
-    def take_facts(self, facts: StatedFacts) -> None:
+    def take_facts(
+        self, camera: CameraFacts, duration: Duration | None = None, bit_depth: int | None = None
+    ) -> None:
         """Take what the file says beside its frames."""
-        self.camera, self.bit_depth = facts.camera, facts.bit_depth
-        self.integration_time, self.time_words = facts.duration or (None, "")
+        self.camera, self.bit_depth = camera, bit_depth
+        self.integration_time, self.time_words = duration or (None, "")
 
     def cards(self) -> tuple[Any, ...]:
         """Return the cards of a FITS file that are not of its samples or their place; else none."""
@@ -136,41 +138,39 @@ def check_window(
         or not buffer.flags.c_contiguous
     ):
         raise ValueError(
-            f"buffer {buffer.shape} {buffer.dtype} does not fit {(t1 - t0, y1 - y0, nx)} {reader.dtype}, "
-            "C order"
+            f"buffer {buffer.shape} {buffer.dtype} does not fit {(t1 - t0, y1 - y0, nx)} {reader.dtype}, C "
+            "order"
         )
     return y0, y1
 
 
 def shared_notes(readers: Sequence[FrameReader]) -> list[str]:
     """Return the remarks on all files; one that many share stands once."""
-    notes = [(reader.paths[0].name, note) for reader in readers for note in dict.fromkeys(reader.notes)]
-    return said_once(
-        (name if note.startswith(f"{name}: ") else "", note.removeprefix(f"{name}: ")) for name, note in notes
-    )
+    notes = ((reader.paths[0].name, note) for reader in readers for note in dict.fromkeys(reader.notes))
+    return said_once((name, note.removeprefix(f"{name}: ")) for name, note in notes)
 
 
 def said_once(said: Iterable[tuple[str, str]]) -> list[str]:
-    """Return what is said of files, all alike once, with the name of the first unless that is empty."""
+    """Return what is said of files, all alike once, with the name of the first."""
     names: dict[str, list[str]] = {}
     for name, words in said:
         names.setdefault(words, []).append(name)
     return [
-        (f"{first}{f' and {len(others)} more' if others else ''}: " if first else "") + words
+        f"{first}{f' and {len(others)} more' if others else ''}: {words}"
         for words, (first, *others) in names.items()
     ]
 
 
-def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks") -> tuple[str, ...]:
+def unwritten_notes(missing: int, wanted: int, what: str = "chunks") -> tuple[str, ...]:
     """Return a remark on parts of a file that were never written; empty where all were.
 
     Raises:
         InputError: none was written.
     """
     if missing >= wanted > 0:
-        raise InputError(f"{path}: none of its {wanted} {what} was written; copy it again or omit it")
+        raise InputError(f"none of its {wanted} {what} was written; copy it again or omit it")
     were = "was" if missing == 1 else "were"
-    words = f"{path.name}: {missing} of {wanted} {what} {were} not written; read as the fill value"
+    words = f"{missing} of {wanted} {what} {were} not written; read as the fill value"
     return (words,) if missing > 0 else ()
 
 
@@ -179,21 +179,24 @@ def sound(path: Path, name: str, magic: tuple[bytes, ...] = ()) -> Iterator[None
     """Turn what a library says of a damaged file of a format, its first bytes its magic, into one line.
 
     Raises:
-        InputError: in place of all but our own errors and a lack of memory.
+        InputError: with the path before what a reader says, and in place of all but our other errors and a
+            lack of memory.
     """
     try:
         yield
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except (PchEmError, MemoryError):
         raise
     except Exception as error:
         if isinstance(error, FileNotFoundError | PermissionError) and error.strerror:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+            raise unreadable(path, error) from error
         words = f"not a valid {name} file, or truncated ({error_words(error)}); copy it again"
         if magic and path.is_file() and not np.fromfile(path, "u1", 64).tobytes().startswith(magic):
             words = f"does not begin as {name} files do; correct its name, or copy it again"
         raise InputError(f"{path}: {words}") from error
 
 
-def changed(path: Path, what: str) -> InputError:
+def changed(what: str) -> InputError:
     """Return the error for a file that is no longer as it was when it was opened."""
-    return InputError(f"{path}: {what} while it was being read; restore the file and start again")
+    return InputError(f"{what} while it was being read; restore the file and start again")

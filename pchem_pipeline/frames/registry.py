@@ -14,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError, InputError, error_words
+from pchem_pipeline.base.errors import ConfigError, InputError, error_words, unreadable
 from pchem_pipeline.frames.reader import FrameReader
 
 ENTRY_POINT_GROUP = "pchem_pipeline.readers"
@@ -109,9 +109,7 @@ def detect_format(path: Path) -> str:
             with path.open("rb") as stream:
                 head = stream.read(64)
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
-        ) from error
+        raise unreadable(path, error) from error
     if not head and not path.is_dir():
         raise InputError(f"{path}: the file is empty; copy it again or omit it")
     for reader in readers():

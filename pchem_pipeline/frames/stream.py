@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unstore
 from pchem_pipeline.frames.identity import SCRATCH_BYTES, FileHasher, identity_of_hashes
-from pchem_pipeline.frames.reader import FrameReader, changed
+from pchem_pipeline.frames.reader import FrameReader, changed, sound
 from pchem_pipeline.frames.sequence import FrameSequence
 
 #: first row of a band, and its end
@@ -156,7 +156,8 @@ class HashedFrameStream(FrameStream):
         for reader, first, end, offset in self._stack.pieces(t0, t1):
             hasher, n_frames = self._hashers[reader.paths[0]], reader.shape[0]
             if self._is_plain(reader):
-                self._take(reader, hasher, (first, end), [part[offset:] for part in parts])
+                with sound(hasher.path, reader.format_name):
+                    self._take(reader, hasher, (first, end), [part[offset:] for part in parts])
             else:
                 hasher.read_to(hasher.size * end // n_frames)
                 decode.append((t0 + offset, t0 + offset + end - first))
@@ -183,14 +184,14 @@ class HashedFrameStream(FrameStream):
             wanted = int(offsets[-1] - offsets[0]) + layout.frame_bytes
             data = hasher.take(wanted)
             if len(data) < wanted:
-                raise changed(hasher.path, "the file was truncated")
+                raise changed("the file was truncated")
             for t, start in enumerate((offsets - offsets[0]).tolist(), a - first):
                 frame = layout.frame(data, start)
                 for part, (y0, y1) in zip(parts, self.bands, strict=True):
                     part[t] = frame[y0:y1]
         for part, (y0, _) in zip(parts, self.bands, strict=True):
             read = part[: end - first]
-            unstore(read, layout.stored, layout.offset, hasher.path)
+            unstore(read, layout.stored, layout.offset)
             reader.put_right(read, first, y0)
             self._stack.check_bits(reader, read, y0)
 

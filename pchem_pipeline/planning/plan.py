@@ -14,7 +14,6 @@ from pchem_pipeline.planning.verify import frames_simulated
 
 #: Without so much knowledge of the gain, one Gaussian fits as well.
 _SEEN = Target("conversion_gain", 25.0, "%")
-_TRIED = 10  # exposures
 # smaller shares are not worth a sample.
 _LEAST_SHARE = 1e-3
 
@@ -133,7 +132,7 @@ def _best(
     first, fewest = best_exposure((*targets, _SEEN), point, low, max_exposure)
     if not np.isfinite(first):
         return first, fewest
-    tried = [first, *np.geomspace(low, max_exposure, _TRIED).tolist()]
+    tried = [first, *np.geomspace(low, max_exposure, 10).tolist()]
     points = [replace(point, quanta_exposure=h) for h in tried]
     bounds = [(max(frames_needed(target, each) for target in targets), each) for each in points]
     best, frames = first, float("inf")

@@ -29,7 +29,7 @@ from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, S
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
-from pchem_pipeline.run.progress import ProgressMode, Reporter, telling_parts
+from pchem_pipeline.run.progress import ProgressFile, ProgressMode, Reporter, telling_parts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
@@ -98,6 +98,10 @@ class Command:
     quiet: bool = False
     log_json: Path | None = None
     max_memory: int | None = None
+
+    def reporter(self, progress_file: ProgressFile | None = None) -> Reporter:
+        """Return what tells of the work."""
+        return Reporter(self.progress, quiet=self.quiet, log=self.log_json, progress_file=progress_file)
 
 
 @functools.lru_cache(maxsize=8)

@@ -157,9 +157,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         stack.enter_context(nothing_left_of_a_refusal(target.store))
         store = RunStore.create(target.store)
         progress_file = ProgressFile(store.path)
-        reporter = Reporter(
-            command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
-        )
+        reporter = command.reporter(progress_file)
         stack.callback(reporter.close)
         context = stack.enter_context(at_work(target, store, reporter, command))
         if (path := target.config_path) is not None:

@@ -42,11 +42,6 @@ _CURES_OF_A_PLACE = {
     ),
 }
 
-#: of a file of chunks that enter its digest: the checksum of one chunk, or what a shard lists
-_LAST_BYTES = 4096
-
-_ERRNO = re.compile(r"errno = (\d+)")
-
 
 def storage_error(error: OSError, path: object) -> StoreError:
     """Translate an error of the file system into one line with its cure; one that is such a line stays."""
@@ -125,7 +120,7 @@ def _put_in_place(path: Path, aside: Path, sync: Callable[[Path], None] | None) 
     except OSError as error:
         raise storage_error(error, path) from error
     except RuntimeError as error:  # of HDF5, which hides the number in its words
-        if (number := _ERRNO.search(str(error))) is None:
+        if (number := re.search(r"errno = (\d+)", str(error))) is None:
             raise
         raise storage_error(OSError(int(number[1]), os.strerror(int(number[1]))), path) from error
     finally:
@@ -224,17 +219,16 @@ def digest_of(path: Path) -> str | None:
 def _mark_of(chunk: str, array: str) -> bytes:
     with open(chunk, "rb", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - _LAST_BYTES, 0))
+        file.seek(max(size - 4096, 0))  # the checksum of one chunk, or what a shard lists
         return f"{chunk.removeprefix(array)} {size} ".encode() + file.read()
 
 
 # -- records of a run: JSON with a digest of itself ------------------------------------------------
 
 _DIGEST = "digest_of_content"
-_SAME_NAME = ("histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods")
 #: the stage which writes a group of arrays
 _STAGE_OF = {
-    **{name: name for name in _SAME_NAME},
+    **{n: n for n in ("histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods")},
     "frames": "ingest",
     "summary": "histogram",
     "truth": "simulate",

@@ -190,10 +190,6 @@ class RemotePath(_Pure):
             raise UndefinedError(f"{self}: not possible in an object storage ({name}); use a store on a disk")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
-    def write_text(self, data: str, encoding: str | None = None, *unused: Any, **more: Any) -> int:
-        """Put a text in the place of an older one."""
-        return self.write_bytes(data.encode(encoding or "utf-8"))
-
     @_asked
     def unlink(self, missing_ok: bool = False) -> None:
         """Remove the object."""

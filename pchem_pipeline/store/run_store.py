@@ -442,16 +442,13 @@ def _one_line(path: Path, where: object) -> Iterator[None]:
     """Make one line of what a file system, or an object storage, refuses."""
     try:
         yield
-    except PchEmError:
-        raise
-    except OSError as error:
-        remote = isinstance(path, RemotePath)
-        raise (refused(where, error) if remote else storage_error(error, where)) from error
-    except (ValueError, RuntimeError, KeyError, TypeError):  # a matter of the content
+    except (PchEmError, ValueError, RuntimeError, KeyError, TypeError):  # ours, or a matter of the content
         raise
     except Exception as error:
         if isinstance(path, RemotePath):  # each kind of storage has errors of its own
             raise refused(where, error) from error
+        if isinstance(error, OSError):
+            raise storage_error(error, where) from error
         raise
 
 

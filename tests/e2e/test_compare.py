@@ -26,6 +26,7 @@ from pchem_pipeline.report.pages.compare import sentence_of
 from pchem_pipeline.report.pages.summary import criteria
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.run_store import RunStore, stored_config
 
@@ -37,11 +38,12 @@ def copies(shell, finished):
     return RunStore.open(shell.folder / "b.zarr", writable=True)
 
 
-def here(shell, *names, **options):
+def here(shell, *names, quiet=False, **options):
     """Compare in this process: the lines that are printed."""
     lines, paths = [], [shell.folder / name for name in names]
     with contextlib.suppress(ChangedError):
-        compare_runs(paths, shell.folder / "compare", progress="off", write=lines.append, **options)
+        command = Command(progress="off", quiet=quiet)
+        compare_runs(paths, shell.folder / "compare", command, write=lines.append, **options)
     return lines
 
 
@@ -183,7 +185,7 @@ def test_the_history_of_a_camera(shell, copies, finished, undrawn):
     labels = ["-20 C", "-10 C", "0 C"]
     paths = [shell.folder / f"{name}.zarr" for name in "abc"]
     with pytest.raises(ChangedError):
-        compare_runs(paths, shell.folder / "history", labels=labels, rate=0.05, progress="off")
+        compare_runs(paths, shell.folder / "history", Command(progress="off"), labels=labels, rate=0.05)
     with (shell.folder / "history" / "history.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["label"] for row in rows] == labels

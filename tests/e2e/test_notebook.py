@@ -19,6 +19,7 @@ from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependenc
 from pchem_pipeline.commands.figures import figures_of_run
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.charts.on_paper import drawing_bytes
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.run_store import RunStore
 
 TUTORIAL = ROOT / "docs" / "tutorial.ipynb"
@@ -98,7 +99,7 @@ def test_a_pixel_is_that_of_the_store(run, store):
 
 def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
     assert len(run.figures) > 10
-    figures_of_run(finished, tmp_path, formats=("svg",), only=("electron_numbers",), progress="off")
+    figures_of_run(finished, tmp_path, Reporter("off"), formats=("svg",), only=("electron_numbers",))
     drawn = drawing_bytes(run.figure("electron_numbers"), "svg", dpi=600, title="Estimated electron numbers")
     assert drawn == (tmp_path / "electron_numbers.svg").read_bytes()
     assert run.figure("map_bias", width=60).get_figwidth() == pytest.approx(60 / 25.4)

@@ -41,7 +41,6 @@ from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.sequence import FrameSequence
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command, StageContext, Task
 from pchem_pipeline.run.target import Target
@@ -64,7 +63,6 @@ _VERSION = 5
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
-_BLOCK_SAMPLES = 1 << 26
 #: Frames from which the scene, or the variances of the offsets in the overscan, are estimated.
 _SCENE_FRAMES = 256
 #: Share of the samples at a limit of the ADC beyond which offsets are not known: with 6 % of them the stated
@@ -88,7 +86,7 @@ def apply_to_frames(
     target = with_overrides(target, command)
     keep_to_limit(target.config.compute.max_memory)
     run = target.stored()
-    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
+    reporter = command.reporter()
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
@@ -180,7 +178,7 @@ def _make_job(
         )
     depth, *_ = _chunks(frames.shape)
     if wanted.format != "zarr":  # files are written by blocks of whole frames
-        depth = max(1, min(depth, _BLOCK_SAMPLES // (frames.shape[1] * frames.shape[2])))
+        depth = max(1, min(depth, (1 << 26) // (frames.shape[1] * frames.shape[2])))
     job = Job(
         target.store,
         frames,
@@ -223,16 +221,14 @@ def _is_wanted(output: Path, found: dict[str, Any], content: dict[str, Any], *, 
     """Return whether an output is the wanted one; raise ConfigError unless it is, or may be replaced."""
     if found == content and not force:
         return True
-    ours = found.get("product") == _PRODUCT
-    if not (force and ours):
-        raise _exists(output, ours=ours)
+    if found.get("product") != _PRODUCT:
+        raise ConfigError(f"{output} exists and has no calibrated frames; choose another --output")
+    if not force:
+        raise ConfigError(
+            f"{output} exists and was made from other frames or with other settings; choose another "
+            "--output, or replace it with --force"
+        )
     return False
-
-
-def _exists(output: Path, *, ours: bool) -> ConfigError:
-    cure = ", or replace it with --force" if ours else ""
-    what = "was made from other frames or with other settings" if ours else "has no calibrated frames"
-    return ConfigError(f"{output} exists and {what}; choose another --output{cure}")
 
 
 def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple[RunStore, bool]:
@@ -240,7 +236,7 @@ def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple
     names = {each.name for each in place.iterdir()} if place.is_dir() else set()
     begun = {name for name in names if not name.startswith(".zarr.json.")}  # not what a killed process left
     if "zarr.json" not in begun and (begun or (place.exists() and not place.is_dir())):
-        raise _exists(place, ours=False)
+        _is_wanted(place, {}, content, force=force)
     if not begun <= {"zarr.json", ".pchem"}:
         found: dict[str, Any] = {}
         with contextlib.suppress(StoreError):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.base.errors import StoreError, quoted
+from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.settings import Job, Piece
 from pchem_pipeline.model.fit.settings import FitSettings
@@ -32,10 +32,13 @@ def check_run(store: RunStore) -> str:
 
     Raises:
         StoreError: the run is not finished as far as its fit.
+        ConfigError: it has no frames.
     """
     record = store.records.read("fit")
     if record is None or not (record.finished and store.records.has_all(record)):
         raise StoreError(f"{store.path} has no complete fit; run: pchem run {quoted(store.path)}")
+    if SensorInfo.read(store).kind == "histograms":
+        raise ConfigError(f"{store.path} was made from ready-made histograms; a run of frames is needed")
     return record.fingerprint
 
 

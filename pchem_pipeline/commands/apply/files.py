@@ -133,8 +133,9 @@ def _write_fits(
     if "exposure" in maps:
         readers = [reader for reader, _, _ in _files(frames)]
         cards = input_cards(frames, readers, frames.camera, frames.stated_integration_time)
-        sci, err = (_map(store, maps.pop(name)) for name in ("exposure", "exposure_stderr"))
-        write("exposure", [_named("SCI", sci), _named("ERR", err), _quality([quality], quality.shape)], cards)
+        parts = (("exposure", "SCI"), ("exposure_stderr", "ERR"))
+        images = [_map(store, maps.pop(name), part) for name, part in parts]
+        write("exposure", [*images, _quality([quality], quality.shape)], cards)
     for name, each in maps.items():
         write(name, [_map(store, each)])
     return written
@@ -162,8 +163,11 @@ def _stack_images(
 
     def images_of(start: int, end: int) -> list[FitsImage]:
         shape = quality.shape if end - start == 1 else (end - start, *quality.shape)
-        sci, *others = (_image(store, each, blocks(each.path, start, end), shape) for each in stacks)
-        images = [_named("SCI", sci)]
+        sci, *others = (
+            _image(store, each, blocks(each.path, start, end), shape, "SCI" * (each is stacks[0]))
+            for each in stacks
+        )
+        images = [sci]
         if with_errors:
             frames = (frame for block in blocks(path, start, end) for frame in block)
             errors = (np.hypot(read, stderr_at(variance, frame)) for frame in frames)
@@ -185,24 +189,24 @@ def _quality(frames: Iterable[NDArray[np.uint32]], shape: tuple[int, ...]) -> Fi
     return FitsImage(frames, shape, np.dtype(np.uint32), cards)
 
 
-def _map(store: RunStore, variable: Variable) -> FitsImage:
-    return _image(store, variable, _blocks(store, variable.path), store.array(variable.path).shape)
+def _map(store: RunStore, variable: Variable, name: str = "") -> FitsImage:
+    return _image(store, variable, _blocks(store, variable.path), store.array(variable.path).shape, name)
 
 
 def _image(
-    store: RunStore, variable: Variable, blocks: Iterator[NDArray[Any]], shape: tuple[int, ...]
+    store: RunStore,
+    variable: Variable,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, ...],
+    name: str = "",
 ) -> FitsImage:
     array = store.array(variable.path)
-    cards: list[Any] = [*image_cards(variable.name, variable.unit, variable.long_name)]
+    cards: list[Any] = [*image_cards(name or variable.name, variable.unit, variable.long_name)]
     if "no_number" in array.attrs:
         cards.append(("NONUMBER", array.attrs["no_number"], "pixels without a number"))
     if variable.name == "quality":
         cards += _bits(FLAGS)
     return FitsImage(blocks, shape, np.dtype(array.dtype), cards)
-
-
-def _named(name: str, image: FitsImage) -> FitsImage:
-    return image._replace(cards=[("EXTNAME", name), *image.cards[1:]])
 
 
 def _bits(flags: Mapping[str, tuple[int, str]]) -> list[tuple[str, str]]:

@@ -33,9 +33,11 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
     else the first after. At most ``max_age`` days may lie between run and frames.
 
     Raises:
-        ConfigError: ``max_age`` without a folder of runs.
+        ConfigError: ``max_age`` without a folder of runs, or ``target`` is a file of something else.
         InputError: no run fits, the one that fits is too old, or dates do not tell which is the last.
     """
+    if target.is_file() and target.suffix.lower() not in (".yaml", ".yml"):
+        raise ConfigError(f"{target} is no run; give the run before the frames: pchem apply run.zarr FRAMES")
     runs = finished_runs(target) if target.is_dir() and stored_config(target) is None else {}
     if not runs and max_age is not None:
         raise ConfigError(f"--max-age: {target} is no folder of finished runs; omit it")

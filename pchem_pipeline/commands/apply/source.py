@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import CameraFacts, unlike
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
@@ -38,10 +38,8 @@ def open_like_run(
 
     Raises:
         InputError: the frames do not fit the pixels of the run.
-        ConfigError: no files are named, or the run has no frames.
+        ConfigError: no files are named.
     """
-    if sensor.kind == "histograms":
-        raise ConfigError(f"{target.store} was made from ready-made histograms; a run of frames is needed")
     settings = _first_sample(target).config.input.model_copy(
         update={"files": tuple(str(each) for each in files), "frame_range": None, "mask": None, "samples": ()}
     )

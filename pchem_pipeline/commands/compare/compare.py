@@ -45,8 +45,9 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, RunFacts, by_change
 from pchem_pipeline.report.pages.compare import COMPARE_JSON, COMPARE_PAGE, lines_of, render_comparison
-from pchem_pipeline.run.progress import ProgressMode, Reporter
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.report.report import draw_and_say
 from pchem_pipeline.store.files import write_atomic
@@ -60,13 +61,12 @@ _ENSEMBLE = ("dn", "counts", "density", "epcd_exact", *_NUCED)
 def compare_runs(
     paths: Sequence[Path],
     folder: Path,
+    command: Command,
     *,
     tolerance: float = 1e-12,
     labels: Sequence[str] = (),
     rate: float = 0.01,
     limits: Sequence[str] = (),
-    progress: ProgressMode = "auto",
-    quiet: bool = False,
     write: Callable[[str], None] = print,
 ) -> None:
     """Compare runs with the first of them, and the last with the one before it in the history.
@@ -75,22 +75,22 @@ def compare_runs(
     new run. Relative differences up to ``tolerance`` count as rounding where the frames are the same; of
     others, pixels count as changed at the false-discovery rate ``rate``. Numbers with which ``labels`` begin
     are the axis of the history; without labels it is the date. ``limits`` are ``name=value`` of the section
-    ``compare``, in place of those of the first run. ``write`` takes each line of what changed; with ``quiet``
-    it gets none where nothing changed.
+    ``compare``, in place of those of the first run. ``write`` takes each line of what changed; of a quiet
+    command it gets none where nothing changed.
 
     Raises:
         ChangedError: something changed; the files are written all the same.
         ConfigError: fewer than two runs, or an option is wrong.
         StoreError: a run has no maps, or the folder cannot be written.
     """
-    reporter = Reporter(progress, quiet=quiet)
+    reporter = command.reporter()
     found, new = comparison_of(paths, folder, reporter, tolerance, labels, rate, limits)
     page, numbers = render_comparison(found, draw_and_say(reporter, "figures"))
     for name, text in ((COMPARE_PAGE, page), (COMPARE_JSON, numbers)):
         write_atomic(folder / name, text.encode())
     if new:
         append_history(folder / HISTORY, new)
-    if found.changed or not quiet:
+    if found.changed or not command.quiet:
         for line in lines_of(found):
             write(line)
     if found.changed:
@@ -117,7 +117,7 @@ def comparison_of(
         raise ConfigError(
             f"--label: {len(labels)} labels for {len(paths)} runs; give one per run, in the same order"
         )
-    given = list(map(_side, paths))
+    given = [_side(path, reporter) for path in paths]
     first, last = given[0], given[-1]
     between = partial(
         _pair, tolerance=tolerance, rate=rate, limits=_limits(first.target, limits), reporter=reporter
@@ -182,7 +182,7 @@ def _before(
     if wanted == order[0] or wanted in known:
         return None if wanted == order[0] else known[wanted]
     with contextlib.suppress(ConfigError, StoreError):
-        side = _side(places[wanted])
+        side = _side(places[wanted], reporter)
         if side.facts.identity == wanted:
             return side
     place = rows[wanted]["run"]
@@ -202,10 +202,12 @@ def _shortest_names(paths: Sequence[Path]) -> list[str]:
     return [path.name for path in paths]
 
 
-def _side(path: Path) -> _Side:
+def _side(path: Path, reporter: Reporter) -> _Side:
     target = find_run(path)
     store = with_maps(target.stored())
-    warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
+    warn_if_old(
+        target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state", reporter
+    )
     states = PixelStates.of(store, target.config)
     sensor = SensorInfo.read(store)
     wanted = states.quality[(states.status & int(FitStatus.EXCLUDED)) == 0]

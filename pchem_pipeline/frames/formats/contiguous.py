@@ -26,10 +26,7 @@ from pchem_pipeline.frames.reader import FrameReader, changed, check_window, sou
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
-_MOST_BYTES = 1 << 30
 _MOST_FRAMES = 1 << 26
-#: of a float of 32 bits that is exact
-_LARGEST_WHOLE = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def even_offsets(
-    path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
+    n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
 ) -> IntArray:
     """Return the byte offsets of frames that lie evenly in a file of ``size`` bytes, the first at ``start``.
 
@@ -87,21 +84,19 @@ def even_offsets(
     """
     step = frame_bytes if step is None else step
     if n_frames and frame_bytes < 1:
-        raise InputError(f"{path}: no frames; omit it")
+        raise InputError("no frames; omit it")
     end = start + step * (n_frames - 1) + frame_bytes
     if n_frames and end > size:
-        raise _truncated(path, n_frames, end, size, max(0, (size - start - frame_bytes) // step + 1))
+        raise _truncated(n_frames, end, size, max(0, (size - start - frame_bytes) // step + 1))
     if n_frames > _MOST_FRAMES:
-        raise InputError(
-            f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
-        )
+        raise InputError(f"{n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape")
     return start + step * np.arange(n_frames, dtype=np.int64)
 
 
-def _truncated(path: Path, n_frames: int, needed: int, size: int, whole: int) -> InputError:
+def _truncated(n_frames: int, needed: int, size: int, whole: int) -> InputError:
     return InputError(
-        f"{path}: truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} complete "
-        "frames); copy the file again"
+        f"truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} complete frames); "
+        "copy the file again"
     )
 
 
@@ -109,16 +104,15 @@ class OpenedFile:
     """A file open for one call; InputError if it vanished, or became shorter since it was inspected."""
 
     def __init__(self, path: Path, size: int) -> None:
-        self._path = path
         try:
             self._handle = os.open(path, os.O_RDONLY)
         except FileNotFoundError as error:
-            raise changed(path, "the file disappeared") from error
+            raise changed("the file disappeared") from error
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+            raise InputError(f"cannot be read ({error.strerror}); check its permissions") from error
         if os.fstat(self._handle).st_size < size:
             os.close(self._handle)
-            raise changed(path, "the file was truncated")
+            raise changed("the file was truncated")
 
     def __enter__(self) -> Self:
         return self
@@ -131,11 +125,11 @@ class OpenedFile:
         done = 0
         while done < len(target):
             try:
-                count = os.preadv(self._handle, [target[done : done + _MOST_BYTES]], offset + done)
+                count = os.preadv(self._handle, [target[done : done + (1 << 30)]], offset + done)
             except OSError as error:
-                raise InputError(f"{self._path}: read error ({error.strerror}); check the disk") from error
+                raise InputError(f"read error ({error.strerror}); check the disk") from error
             if count == 0:
-                raise changed(self._path, "the file was truncated")
+                raise changed("the file was truncated")
             done += count
 
     def read_bytes(self, offset: int, count: int) -> bytes:
@@ -148,6 +142,7 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `_decode_into`."""
 
+    size: int  # of the file, bytes
     _offset: int | None = None
     _full: tuple[int, ...] = ()
 
@@ -156,39 +151,33 @@ class ContiguousReader(FrameReader):
         """See `FrameReader.open`."""
         reader = cls()
         with sound(path, cls.format_name, cls.magic):
+            reader.paths, reader.size = (path,), path.stat().st_size
             reader._inspect(path, settings)
-        reader.notes += axes_notes(path, reader._full)
+        reader.notes += axes_notes(reader._full)
         return reader
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         """Take from a file all that a reader says of it; any error becomes one line."""
         raise NotImplementedError
 
-    def set_layout(self, path: Path, layout: Layout, size: int) -> None:
-        """Take the layout; InputError: the file's ``size`` is less than the layout says."""
-        if layout.end > size:
-            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
-            raise _truncated(path, layout.offsets.size, layout.end, size, whole)
-        self.paths = (path,)
+    def set_layout(self, layout: Layout) -> None:
+        """Take the layout; InputError: the file is shorter than the layout says."""
+        if layout.end > self.size:
+            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= self.size))
+            raise _truncated(layout.offsets.size, layout.end, self.size, whole)
         self.shape = (layout.offsets.size, layout.rows, layout.columns)
         self.dtype = unsigned_type(layout.stored)
         self._layout = layout
-        self._size = size
 
     def set_stack(
-        self,
-        path: Path,
-        full: Sequence[int],
-        stored: np.dtype[Any],
-        settings: InputSettings | None,
-        what: str,
+        self, full: Sequence[int], stored: np.dtype[Any], settings: InputSettings | None, what: str
     ) -> None:
         """Set the stack's shape and type from those of the stored array; InputError: these are no frames.
 
         Without settings, the file says itself what its signed samples mean. Messages call the array ``what``.
         """
-        self._offset = None if settings is None else check_samples(path, stored, settings)
-        self.paths, self.shape = (path,), stack_shape(path, full, what)
+        self._offset = None if settings is None else check_samples(stored, settings)
+        self.shape = stack_shape(full, what)
         self.dtype, self._full = unsigned_type(stored), tuple(full)
 
     @property
@@ -204,14 +193,16 @@ class ContiguousReader(FrameReader):
         layout, path = self.layout, self.paths[0]
         if layout is None:
             try:
+                if not path.is_dir() and path.stat().st_size != self.size:
+                    raise changed("the size of the file changed")
                 self._decode_into(buffer, t0, t1, y0, y1)
             except FileNotFoundError as error:
-                raise changed(path, "the file disappeared") from error
+                raise changed("the file disappeared") from error
             except InputError:
                 raise
             except Exception as error:
-                raise InputError(f"{path}: cannot be decoded ({error}); copy it again") from error
-            unstore(buffer, self.dtype, self._offset, path)
+                raise InputError(f"cannot be decoded ({error}); copy it again") from error
+            unstore(buffer, self.dtype, self._offset)
             return
         if layout.packing is not None:
             self._read_packed(layout.packing, buffer, layout.offsets[t0:t1], y0 * layout.columns)
@@ -219,11 +210,11 @@ class ContiguousReader(FrameReader):
         skip = y0 * layout.columns * layout.stored.itemsize
         target = buffer.data.cast("B")
         band = len(target) // (t1 - t0)
-        with OpenedFile(path, self._size) as file:
+        with OpenedFile(path, self.size) as file:
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
-        unstore(buffer, layout.stored, layout.offset, path)
+        unstore(buffer, layout.stored, layout.offset)
         self.put_right(buffer, t0, y0)
 
     def _read_packed(
@@ -232,7 +223,7 @@ class ContiguousReader(FrameReader):
         """Fill the buffer from frames whose samples are packed, from one of their samples on."""
         n_samples = buffer[0].size
         start, end, before = packing.span(first_sample, first_sample + n_samples)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             for frame, offset in zip(buffer, offsets.tolist(), strict=True):
                 data = np.frombuffer(file.read_bytes(offset + start, end - start), np.uint8)
                 frame.ravel()[:] = packing.unpacked(data)[before : before + n_samples]
@@ -252,7 +243,7 @@ def _runs(offsets: IntArray, frame_bytes: int) -> list[tuple[int, int]]:
     return [(a, b - a) for a, b in pairwise(edges)]
 
 
-def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
+def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None) -> None:
     """Turn stored bytes in a buffer of unsigned samples into these, in place.
 
     Floats hold whole numbers; an offset, 0 to 2**(bits - 1), is added to signed samples; None: unsigned.
@@ -264,11 +255,12 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
         buffer.byteswap(inplace=True)
     if stored.kind == "f":
         values = buffer.view(f"f{stored.itemsize}")
-        whole = (values >= 0) & (values <= _LARGEST_WHOLE) & (values == np.floor(values))
+        # larger ones are not exact
+        whole = (values >= 0) & (values <= 1 << 24) & (values == np.floor(values))
         if not whole.all():
             raise InputError(
-                f"{path}: samples such as {values[~whole][0]:g}, raw whole numbers are needed; record them "
-                "without a correction, background or averaging"
+                f"samples such as {values[~whole][0]:g}, raw whole numbers are needed; record them without a "
+                "correction, background or averaging"
             )
         buffer[...] = values
         return
@@ -279,7 +271,7 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
         lowest = int(buffer.view(f"i{stored.itemsize}").min()) + offset
         if lowest < 0:
             raise InputError(
-                f"{path}: negative samples (down to {lowest} "
+                f"negative samples (down to {lowest} "
                 f"DN{f', with the offset of {offset}' if offset else ''}), 0 or more needed; set "
                 f"input.offset: {top} (--offset {top}) if 0 DN is stored as -{top}"
             )

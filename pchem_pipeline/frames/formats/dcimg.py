@@ -51,14 +51,13 @@ class DcimgReader(ContiguousReader):
     _apart: tuple[int, int, int, slice] | None = None
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
-        size = path.stat().st_size
         with path.open("rb") as stream:
             head = stream.read(_FILE.size)
             if not head.startswith(_MAGIC):
                 raise ValueError
             version, sessions, session = _FILE.unpack(head)
             if version != _OLD and version < _NEW:
-                raise InputError(f"{path}: DCIMG of unknown version {version:#x}; export it as TIFF")
+                raise InputError(f"DCIMG of unknown version {version:#x}; export it as TIFF")
             parts = _SESSION[min(version, _NEW)]
             stream.seek(session)
             fields = parts.unpack(stream.read(parts.size))
@@ -66,22 +65,22 @@ class DcimgReader(ContiguousReader):
         if version != _OLD:
             row_bytes, rows = rows, row_bytes
         if depth not in (1, 2):
-            raise InputError(f"{path}: pixel type {depth}; record monochrome frames of 8 or 16 bits")
+            raise InputError(f"pixel type {depth}; record monochrome frames of 8 or 16 bits")
         if not 0 < columns * depth <= row_bytes or row_bytes % depth or row_bytes * rows != frame_bytes:
             raise InputError(
-                f"{path}: damaged header ({rows} x {columns} samples, {row_bytes} bytes a row, {frame_bytes} "
-                "a frame); copy it again"
+                f"damaged header ({rows} x {columns} samples, {row_bytes} bytes a row, {frame_bytes} a "
+                "frame); copy it again"
             )
         behind = 0 if version == _OLD else footer
         step, wide = frame_bytes + behind, row_bytes // depth
-        offsets = even_offsets(path, n, frame_bytes, size, start=session + start, step=step)
-        self.set_layout(path, Layout(offsets, rows, wide, np.dtype(f"<u{depth}")), size)
+        offsets = even_offsets(n, frame_bytes, self.size, start=session + start, step=step)
+        self.set_layout(Layout(offsets, rows, wide, np.dtype(f"<u{depth}")))
         if sessions > 1:
-            self.notes += (f"{path.name}: {sessions} sessions, the first is read",)
+            self.notes += (f"{sessions} sessions, the first is read",)
         if wide > columns:
             self.notes += (
-                f"{path.name}: rows of {wide} samples, {columns} by the header; all are read; choose with "
-                f"input.roi: [0, {rows}, 0, {columns}] or [0, {rows}, {wide - columns}, {wide}] (--roi)",
+                f"rows of {wide} samples, {columns} by the header; all are read; choose with input.roi: [0, "
+                f"{rows}, 0, {columns}] or [0, {rows}, {wide - columns}, {wide}] (--roi)",
             )
         if n and version == _OLD:
             self._take_footer(session + footer)
@@ -92,7 +91,7 @@ class DcimgReader(ContiguousReader):
         """Take what the footer of version 7 says, which begins at ``start``."""
         n, stamps = self.shape[0], start + _BEFORE_STAMPS
         self._check_end(stamps + _STAMP * n)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             (table,) = _FOOTER.unpack(file.read_bytes(start, _FOOTER.size))
             self._check_end(start + table + _TABLE.size)
             at, place, n_bytes = _TABLE.unpack(file.read_bytes(start + table, _TABLE.size))
@@ -108,7 +107,7 @@ class DcimgReader(ContiguousReader):
         starts = (self._layout.offsets + frame_bytes).tolist()
         self._check_end(starts[-1] + n_bytes)
         numbers = np.empty((len(starts), 3), "<u4")
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             for line, start in zip(numbers, starts, strict=True):
                 file.read_into(line.data.cast("B"), start)
             n_apart = len(_MARKER) if n_bytes == 32 or n_bytes >= 512 else 0
@@ -119,9 +118,8 @@ class DcimgReader(ContiguousReader):
             self._set_apart(starts[0] + _STAMP, frame_bytes + n_bytes, len(apart), row, 0)
         elif any(apart):
             self.notes += (
-                f"{self.paths[0].name}: the first {len(apart) // self.dtype.itemsize} samples of a row are "
-                "stored apart, and no row is marked as theirs; if pixels at the left edge stand out, exclude "
-                "them (input.mask)",
+                f"the first {len(apart) // self.dtype.itemsize} samples of a row are stored apart, and no "
+                "row is marked as theirs; if pixels at the left edge stand out, exclude them (input.mask)",
             )
 
     def _take_stamps(self, numbers: NDArray[Any], times: NDArray[Any]) -> None:
@@ -145,15 +143,14 @@ class DcimgReader(ContiguousReader):
         end = column + n_bytes // self.dtype.itemsize
         if row >= rows or end > columns or n_bytes % self.dtype.itemsize:
             raise InputError(
-                f"{self.paths[0]}: damaged footer ({n_bytes} bytes for row {row}, column {column}); copy it "
-                "again"
+                f"damaged footer ({n_bytes} bytes for row {row}, column {column}); copy it again"
             )
         self._check_end(start + step * (n - 1) + n_bytes)
         self._apart = start, step, row, slice(column, end)
 
     def _check_end(self, end: int) -> None:
-        if end > self._size:
-            raise InputError(f"{self.paths[0]}: truncated in its footer; copy the file again")
+        if end > self.size:
+            raise InputError("truncated in its footer; copy the file again")
 
     def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
         """See `ContiguousReader.put_right`."""
@@ -162,7 +159,7 @@ class DcimgReader(ContiguousReader):
         start, step, row, columns = self._apart
         stored = self._layout.stored
         n_bytes = stored.itemsize * (columns.stop - columns.start)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             for t, frame in enumerate(buffer, t0):
                 frame[row - y0, columns] = np.frombuffer(file.read_bytes(start + t * step, n_bytes), stored)
 

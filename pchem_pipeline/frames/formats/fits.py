@@ -26,7 +26,6 @@ from pchem_pipeline.frames.camera import (
     TIME_UNIT,
     CameraFacts,
     Duration,
-    StatedFacts,
     agreed_duration,
     bits_of,
     celsius,
@@ -45,15 +44,11 @@ from pchem_pipeline.frames.formats.kinds import (
     mosaic_note,
     windows,
 )
-from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.registry import check_unpacked
 from pchem_pipeline.frames.settings import Area, InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "INTTIME", "ITIME")
-#: of these the first counts where the others are absent: with dead time, or without it
-_TOTAL_TIME_KEYWORDS = ("TELAPSE", "XPOSURE")
-_DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
 _SETUP_KEYWORDS = ("GAIN", "OFFSET", "READMODE", "READOUTM", "XBINNING", "YBINNING", "IMAGETYP")
@@ -89,22 +84,21 @@ class FitsReader(ContiguousReader):
         require("astropy.io.fits", "fits", "FITS files")
         from astropy.io import fits
 
-        size = path.stat().st_size
         with path.open("rb") as stream:
             check_unpacked(path, stream.read(8))
         options = {"memmap": False, "do_not_scale_image_data": True, "lazy_load_hdus": True}
         # truncation and sloppy headers are reported below
         with warnings.catch_warnings(action="ignore"), fits.open(path, **options) as hdus:
-            self._numbers = _images(path, hdus, settings)
+            self._numbers = _images(hdus, settings)
             hdu, several = hdus[self._numbers[0]], len(self._numbers) > 1
             header, primary = hdu.header, hdus[0].header
             sizes = [header[f"NAXIS{axis}"] for axis in range(header["NAXIS"], 0, -1)]
             sizes = [len(self._numbers), *sizes] if several else sizes
             compressed = isinstance(hdu, fits.CompImageHDU)
-            stored, zero = _samples(path, header, compressed)
-            self.set_stack(path, sizes, stored, None if zero else settings, "image")
+            stored, zero = _samples(header, compressed)
+            self.set_stack(sizes, stored, None if zero else settings, "image")
             n, rows, columns = self.shape
-            self.notes = _value_notes(path, header, n, several=several)
+            self.notes = _value_notes(header, n, several=several)
             if compressed:
                 self.notes += _coding_notes(
                     path, self._numbers, stored.itemsize * math.prod(hdu.tile_shape), biased=bool(zero)
@@ -114,15 +108,14 @@ class FitsReader(ContiguousReader):
             end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
             self._read_facts(primary, header)
         if compressed:
-            if end > size:
-                raise InputError(f"{path}: truncated: {end} bytes needed, the file has {size}; copy it again")
-            self._size = size
-            check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
+            if end > self.size:
+                raise InputError(f"truncated: {end} bytes needed, the file has {self.size}; copy it again")
+            check_coded(self.shape, hdu.tile_shape, stored.itemsize, self.size)
             return
         offsets = np.array(starts, np.int64)
         if not several:
-            offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=starts[0])
-        self.set_layout(path, Layout(offsets, rows, columns, stored, zero or self._offset), size)
+            offsets = even_offsets(n, rows * columns * stored.itemsize, self.size, start=starts[0])
+        self.set_layout(Layout(offsets, rows, columns, stored, zero or self._offset))
 
     def _read_facts(self, *headers: Any) -> None:
         """Take each fact from the last header that has it."""
@@ -133,9 +126,9 @@ class FitsReader(ContiguousReader):
             header = next((each for each in last if name in each), None)  # the image's own before the primary
             return header and duration_of(name, header[name], *units, comment=str(header.comments[name]))
 
-        duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(
-            map(time_of, _TOTAL_TIME_KEYWORDS)
-        )
+        # with dead time, or without it
+        whole = map(time_of, ("TELAPSE", "XPOSURE"))
+        duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(whole)
 
         def area_of(names: Sequence[str]) -> Area | None:
             sections = (header[name] for name in names for header in last if name in header)
@@ -143,8 +136,8 @@ class FitsReader(ContiguousReader):
             return found
 
         self.active, self.overscan = area_of(_ACTIVE_KEYWORDS), area_of(_OVERSCAN_KEYWORDS)
-        depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
-        self.take_facts(StatedFacts(_camera(last), duration, first_of(depths)))
+        depths = (bits_of(header.get(name)) for header in last for name in ("BITDEPTH", "ADCBITS"))
+        self.take_facts(_camera(last), duration, first_of(depths))
 
     def cards(self) -> tuple[Any, ...]:
         """See `FrameReader.cards`."""
@@ -163,10 +156,7 @@ class FitsReader(ContiguousReader):
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         from astropy.io import fits
 
-        path = self.paths[0]
-        if path.stat().st_size != self._size:
-            raise changed(path, "the size of the file changed")
-        with _LOCK, fits.open(path, memmap=False) as hdus:
+        with _LOCK, fits.open(self.paths[0], memmap=False) as hdus:
             if len(self._numbers) == 1:
                 for part, window in windows(buffer, self._full, t0, y0):
                     part[...] = hdus[self._numbers[0]].section[window]
@@ -175,7 +165,7 @@ class FitsReader(ContiguousReader):
                     frame[...] = hdus[number].section[y0:y1]
 
 
-def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
+def _images(hdus: Any, settings: InputSettings) -> list[int]:
     """Return the number of the only image of the file, or those of extensions with a frame each."""
     from astropy.io import fits
 
@@ -183,7 +173,7 @@ def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
     numbered = ((n, hdu) for n, hdu in enumerate(hdus) if isinstance(hdu, kind))
     images = [(n, hdu) for n, hdu in numbered if hdu.header.get("NAXIS", 0) >= 2]
     if not images:
-        raise InputError(f"{path}: no image; omit it")
+        raise InputError("no image; omit it")
     if settings.dataset is not None:
         wanted = settings.dataset.strip()
         images = [(n, hdu) for n, hdu in images if wanted in (str(n), hdu.name)]
@@ -194,8 +184,8 @@ def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
         names = first_few((f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images), 12) or "none"
         names += f", which differ in {', '.join(differing[:4])}" if differing else ""
         raise InputError(
-            f"{path}: images in the file{' with this name' * (settings.dataset is not None)}: {names}; "
-            "choose one by its number in input.dataset (--dataset), or write the frames as one cube"
+            f"images in the file{' with this name' * (settings.dataset is not None)}: {names}; choose one by "
+            "its number in input.dataset (--dataset), or write the frames as one cube"
         )
     return [n for n, _ in images]
 
@@ -207,22 +197,20 @@ def _kind(hdu: Any) -> dict[str, str]:
     return {name: f"{each:.3g}" if isinstance(each, float) else str(each) for name, each in values.items()}
 
 
-def _value_notes(path: Path, header: Any, frames: int, *, several: bool) -> tuple[str, ...]:
+def _value_notes(header: Any, frames: int, *, several: bool) -> tuple[str, ...]:
     """Say where pixels may be no samples, or planes no frames."""
     notes = []
     if "BLANK" in header:
-        notes.append(f"{path.name}: BLANK = {header['BLANK']} marks pixels without a value; read as stored")
+        notes.append(f"BLANK = {header['BLANK']} marks pixels without a value; read as stored")
     if pattern := text_of(header.get("BAYERPAT")):
-        notes.append(mosaic_note(path, pattern))
+        notes.append(mosaic_note(pattern))
     if several:
         notes.append(
-            f"{path.name}: its {frames} images are read as frames; if they are parts of a sensor, choose one "
-            "by input.dataset (--dataset)"
+            f"its {frames} images are read as frames; if they are parts of a sensor, choose one by "
+            "input.dataset (--dataset)"
         )
     elif frames == 3:
-        notes.append(
-            f"{path.name}: its 3 planes are read as frames; if they are colours, write one file per colour"
-        )
+        notes.append("its 3 planes are read as frames; if they are colours, write one file per colour")
     return tuple(notes)
 
 
@@ -241,17 +229,16 @@ def _coding_notes(path: Path, numbers: Sequence[int], piece: int, *, biased: boo
             deflated = {"COMPRESSED_DATA"} if coding.startswith("GZIP") else set()
             for name in {*deflated, "GZIP_COMPRESSED_DATA"} & {*hdus[number].columns.names}:
                 some = chosen_pieces(hdus[number].data[name], len)
-                check_unpacked_size(path, (tile.tobytes() for tile in some), piece, ["gzip"])
+                check_unpacked_size((tile.tobytes() for tile in some), piece, ["gzip"])
             options = {str(header[f"ZNAME{i}"]).strip(): header.get(f"ZVAL{i}") for i in _numbers(header)}
             if coding.startswith("PLIO") and biased:
                 raise InputError(
-                    f"{path}: unsigned samples compressed by PLIO cannot be decoded reliably; unpack with "
-                    "funpack"
+                    "unsigned samples compressed by PLIO cannot be decoded reliably; unpack with funpack"
                 )
             if coding.startswith("HCOMPRESS") and float(options.get("SCALE") or 0) != 0:
                 notes.append(
-                    f"{path.name}: lossy compression (HCOMPRESS, scale {options['SCALE']}); noise and "
-                    "histograms are altered"
+                    f"lossy compression (HCOMPRESS, scale {options['SCALE']}); noise and histograms are "
+                    "altered"
                 )
     return tuple(dict.fromkeys(notes))
 
@@ -296,7 +283,7 @@ def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:
     return None, ""
 
 
-def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], int]:
+def _samples(header: Any, compressed: bool) -> tuple[np.dtype[Any], int]:
     """Return the stored type, and what BZERO adds to signed samples, 0 where nothing is."""
     bits = int(header["BITPIX"])
     zero, scale = header.get("BZERO", 0), header.get("BSCALE", 1)
@@ -306,7 +293,7 @@ def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], 
     top = UNSIGNED_ZERO.get(bits, 0)
     plain = not compressed and not isinstance(zero, str) and zero == int(zero)
     if scale != 1 or not (zero in (0, top) or (plain and 0 < zero < top)):
-        raise InputError(f"{path}: scaled data (BSCALE {scale}, BZERO {zero}), no raw DN; write raw integers")
+        raise InputError(f"scaled data (BSCALE {scale}, BZERO {zero}), no raw DN; write raw integers")
     return stored, int(zero)
 
 

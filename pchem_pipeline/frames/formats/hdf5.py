@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError, quoted, require
-from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
+from pchem_pipeline.frames.camera import FACT_NAMES, Stated, facts_from_names, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
@@ -40,7 +40,7 @@ from pchem_pipeline.frames.formats.kinds import (
     n_pieces,
     windows,
 )
-from pchem_pipeline.frames.reader import changed, unwritten_notes
+from pchem_pipeline.frames.reader import unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -77,9 +77,9 @@ class Hdf5Reader(ContiguousReader):
         except OSError as error:
             words = "is open for writing or was not closed; wait for the writing program"
             if "already open for write" in str(error):
-                raise InputError(f"{path}: {words}, or clear the flag: h5clear -s {quoted(path)}") from error
+                raise InputError(f"{words}, or clear the flag: h5clear -s {quoted(path)}") from error
             if isinstance(error, BlockingIOError):
-                raise InputError(f"{path}: {words}") from error
+                raise InputError(f"{words}") from error
             raise
 
     def _inspect_file(self, path: Path, file: Any, settings: InputSettings) -> None:
@@ -90,9 +90,7 @@ class Hdf5Reader(ContiguousReader):
 
         def visit(name: str, item: Any) -> None:
             if len(found) > _MOST_ITEMS or name.count("/") > _DEEPEST:
-                raise InputError(
-                    f"{path}: more than {_MOST_ITEMS} items, or too deeply nested groups; omit it"
-                )
+                raise InputError(f"more than {_MOST_ITEMS} items, or too deeply nested groups; omit it")
             if isinstance(item, h5py.Dataset):
                 if item.is_virtual and wanted in (None, name, f"/{name}"):
                     check_virtual(path, item)  # the library may look at its parts for the shape
@@ -104,36 +102,33 @@ class Hdf5Reader(ContiguousReader):
         file.visititems(visit)
         if not any(len(shape) >= 3 for shape in found.values()) or wanted is not None:
             check_links(path, file, wanted)
-        self._name = choose_dataset(path, found, settings.dataset)
+        self._name = choose_dataset(found, settings.dataset)
         dataset = file[self._name]
-        self.set_stack(path, dataset.shape, dataset.dtype, settings, f"dataset {self._name}")
-        size = path.stat().st_size
-        check_filters(path, dataset)
+        self.set_stack(dataset.shape, dataset.dtype, settings, f"dataset {self._name}")
+        check_filters(dataset)
         if dataset.is_virtual:
             held = sum(part.stat().st_size for part in virtual_files(path, dataset))
-            check_coded(path, self.shape, self.shape[1:], self.dtype.itemsize, size + held)
+            check_coded(self.shape, self.shape[1:], self.dtype.itemsize, self.size + held)
         self.notes = check_sources(path, dataset)
         if "MATLAB_class" in dataset.attrs:  # it writes axes in reverse order
-            self.notes += (f"{path.name}: written by MATLAB: last axis read as frames, columns as rows",)
+            self.notes += ("written by MATLAB: last axis read as frames, columns as rows",)
         if dataset.chunks is not None:
-            check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
-            _check_chunks(path, dataset)
+            check_coded(self.shape, dataset.chunks, self.dtype.itemsize, self.size)
+            _check_chunks(dataset)
         missing = _missing_chunks(path, dataset)
         self.notes += missing
         self.unwritten = bool(missing)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
-            self.set_layout(path, Layout(offsets, *self.shape[1:], dataset.dtype, self._offset), size)
+            self.set_layout(Layout(offsets, *self.shape[1:], dataset.dtype, self._offset))
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         groups = [dataset.parent, *(detectors if len(detectors) == 1 else [])]
-        self.take_facts(_stated_facts(dataset, groups))
+        self.take_facts(*_stated_facts(dataset, groups))
 
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         with _LOCK, opened(self.paths[0]) as file:
             dataset = file[self._name]
-            if tuple(dataset.shape) != self._full:
-                raise changed(self.paths[0], "the shape of the dataset changed")
             for part, window in windows(buffer, self._full, t0, y0):
                 if dataset.dtype == part.dtype:
                     dataset.read_direct(part, window)
@@ -152,12 +147,12 @@ def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
     """Say how many chunks were never written, and read as the fill value; refuse a dataset without any."""
     if dataset.chunks is None:
         plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
-        return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
+        return unwritten_notes(int(plain and dataset.size > 0), 1, "datasets")
     wanted = n_pieces(dataset.shape, dataset.chunks)
-    return unwritten_notes(path, wanted - dataset.id.get_num_chunks(), wanted)
+    return unwritten_notes(wanted - dataset.id.get_num_chunks(), wanted)
 
 
-def _check_chunks(path: Path, dataset: Any) -> None:
+def _check_chunks(dataset: Any) -> None:
     """Refuse chunks that are not what their shape says, or were compressed twice.
 
     Beyond plain chunks that are too short the library reads on, and crashes.
@@ -173,13 +168,13 @@ def _check_chunks(path: Path, dataset: Any) -> None:
     chunks, size = _chunks_of(dataset), math.prod(dataset.chunks) * dataset.dtype.itemsize
     if not filters:
         if odd := {chunk.size for chunk in chunks} - {size}:
-            raise InputError(f"{path}: damaged: a chunk of {min(odd)} bytes, {size} needed; copy it again")
+            raise InputError(f"damaged: a chunk of {min(odd)} bytes, {size} needed; copy it again")
         return
     coded = sum(1 << number for number, codec in enumerate(codecs) if codec)
     some = chosen_pieces(chunks, attrgetter("size"))
     read = (dataset.id.read_direct_chunk(chunk.chunk_offset) for chunk in some)
     pieces = (data for left_out, data in read if not left_out & coded)
-    check_unpacked_size(path, pieces, 4 * size, codecs)
+    check_unpacked_size(pieces, 4 * size, codecs)
 
 
 def _plain_offsets(path: Path, file: Any, dataset: Any, shape: tuple[int, int, int]) -> IntArray | None:
@@ -193,7 +188,7 @@ def _plain_offsets(path: Path, file: Any, dataset: Any, shape: tuple[int, int, i
         return None
     if dataset.chunks is None:  # None where it lies elsewhere, is virtual, or was never written
         start, size = dataset.id.get_offset(), path.stat().st_size
-        return None if start is None else even_offsets(path, n_frames, frame_bytes, size, start=start)
+        return None if start is None else even_offsets(n_frames, frame_bytes, size, start=start)
     filters = dataset.id.get_create_plist().get_nfilters()
     whole = dataset.ndim == 3 and dataset.chunks[1:] == dataset.shape[1:]
     if filters or not whole or not hasattr(dataset.id, "chunk_iter"):
@@ -233,7 +228,7 @@ def _is_detector(group: Any) -> bool:
     return text_of(group.attrs.get("NX_class")) == "NXdetector"
 
 
-def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
+def _stated_facts(dataset: Any, groups: list[Any]) -> Stated:
     """Return what the attributes of the dataset say, else values (count_time in NeXus) in some groups.
 
     These are that of the dataset, and the detector where the frames are in NXdata by a link.

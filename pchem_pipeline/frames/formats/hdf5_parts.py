@@ -42,7 +42,7 @@ def check_links(path: Path, file: Any, wanted: str | None) -> None:
     names = [name for name in found if wanted is None or name == wanted.strip("/")]
     if asked := [f"{name} in {found[name]}" for name in names if may_be_a_stack(name)]:
         raise InputError(
-            f"{path}: its frames are in other files: {first_few(asked)}; give those, with "
+            f"its frames are in other files: {first_few(asked)}; give those, with "
             "--integration-time and --bit-depth from this file, or choose a dataset with --dataset"
         )
 
@@ -61,15 +61,15 @@ def check_sources(path: Path, dataset: Any) -> tuple[str, ...]:
     bad = [source.file_name for source in sources if not _is_whole(path, source)]
     if bad:
         raise InputError(
-            f"{path}: {len(bad)} of the {len(sources)} parts of {dataset.name} are missing or truncated, the "
-            f"first in {bad[0]}; restore these files"
+            f"{len(bad)} of the {len(sources)} parts of {dataset.name} are missing or truncated, the first "
+            f"in {bad[0]}; restore these files"
         )
-    notes = _elsewhere(path, {source.file_name for source in sources} - {"."})
+    notes = _elsewhere({source.file_name for source in sources} - {"."})
     try:
         covered = sum(source.vspace.get_select_npoints() for source in sources)
     except (RuntimeError, ValueError):  # no end
         return notes
-    return notes + unwritten_notes(path, dataset.size - covered, dataset.size, "samples")
+    return notes + unwritten_notes(dataset.size - covered, dataset.size, "samples")
 
 
 def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
@@ -78,26 +78,26 @@ def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
     for name, offset, size in dataset.external:
         if not Path(name).exists():  # so the library looks for it: from the current folder
             raise InputError(
-                f"{path}: the samples of {dataset.name} are in {name}, which is not found; start the command "
-                "in the folder of this file"
+                f"the samples of {dataset.name} are in {name}, which is not found; start the command in the "
+                "folder of this file"
             )
         found += max(0, min(size, _source_file(path, Path(name)).stat().st_size - offset))
     names = {name for name, *_ in dataset.external}
     if found < needed:
         raise InputError(
-            f"{path}: the samples of {dataset.name} are in {', '.join(sorted(names)[:4])}, truncated: "
-            f"{needed} bytes needed, {found} found; copy the file again"
+            f"the samples of {dataset.name} are in {', '.join(sorted(names)[:4])}, truncated: {needed} bytes "
+            f"needed, {found} found; copy the file again"
         )
-    return _elsewhere(path, names)
+    return _elsewhere(names)
 
 
 def _source_file(path: Path, other: Path) -> Path:
     """Return a file that another one names as its source; refuse one that is not beside or below that one."""
     home, real = path.resolve().parent, other.resolve()
     if home not in real.parents:
-        raise InputError(f"{path}: its source {real} is not in the same folder or below; copy it there")
+        raise InputError(f"its source {real} is not in the same folder or below; copy it there")
     if real.exists() and not real.is_file():
-        raise InputError(f"{path}: its source {real} is not a regular file; copy it again")
+        raise InputError(f"its source {real} is not a regular file; copy it again")
     return real
 
 
@@ -112,8 +112,7 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
     here = (*above, (path.resolve(), dataset.name.strip("/")))
     if len(here) > _DEEPEST or dataset.id.get_create_plist().get_virtual_count() > _MOST_PARTS:
         raise InputError(
-            f"{path}: {dataset.name} has too many or too deeply nested parts; copy its frames into one "
-            "dataset"
+            f"{dataset.name} has too many or too deeply nested parts; copy its frames into one dataset"
         )
     sources = dataset.virtual_sources()
     for source in sources:
@@ -125,7 +124,7 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
                 _source_file(path, each)
             continue
         if (other, source.dset_name.strip("/")) in here:
-            raise InputError(f"{path}: {dataset.name} contains itself; write its frames again")
+            raise InputError(f"{dataset.name} contains itself; write its frames again")
         with suppress(OSError), opened(other) as file:
             part = _plain(file, source.dset_name)
             if getattr(part, "is_virtual", False):
@@ -177,8 +176,8 @@ def opened(path: Path) -> Any:
         return h5py.File(path, "r", locking=False)
 
 
-def _elsewhere(path: Path, names: set[str]) -> tuple[str, ...]:
-    words = f"{path.name}: its frames are in {len(names)} other files; changes of these are not detected"
+def _elsewhere(names: set[str]) -> tuple[str, ...]:
+    words = f"its frames are in {len(names)} other files; changes of these are not detected"
     return (words,) if names else ()
 
 
@@ -207,7 +206,7 @@ def _fits(part: Any, source: Any) -> bool:
     return all(length > end for length, end in zip(part.shape, last, strict=True))
 
 
-def check_filters(path: Path, dataset: Any) -> None:
+def check_filters(dataset: Any) -> None:
     """Raise InputError if a dataset is coded by a filter that is not installed."""
     from h5py import h5z
 
@@ -221,6 +220,6 @@ def check_filters(path: Path, dataset: Any) -> None:
         except (OSError, ValueError) as error:
             words = name.decode("utf-8", "replace") or "without a name"
             raise InputError(
-                f"{path}: {dataset.name} needs HDF5 filter {code} ({words}), which is not installed; install "
-                f"it ({install_hint('hdf5')} has most), or write the file again with gzip"
+                f"{dataset.name} needs HDF5 filter {code} ({words}), which is not installed; install it "
+                f"({install_hint('hdf5')} has most), or write the file again with gzip"
             ) from error

@@ -8,7 +8,6 @@ import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -39,7 +38,7 @@ _DECODERS: dict[str, Callable[[], Any]] = {
 _COMPRESSING = {*_SIZES, *_DECODERS, "zstd"}
 
 
-def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
+def check_samples(dtype: np.dtype[Any], settings: InputSettings) -> int | None:
     """Return what is to be added to signed samples, DN; None for unsigned ones. Refuse all others.
 
     Raises:
@@ -49,36 +48,34 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
     wanted = settings.dtype
     if dtype.kind == "u" and dtype.itemsize in (1, 2, 4):
         if wanted is not None and np.dtype(wanted).itemsize != dtype.itemsize:
-            raise InputError(
-                f"{path}: has {dtype.name} samples, but input.dtype is {wanted}; correct input.dtype"
-            )
+            raise InputError(f"has {dtype.name} samples, but input.dtype is {wanted}; correct input.dtype")
         if settings.offset is not None:
-            raise InputError(f"{path}: has unsigned samples ({dtype.name}); remove input.offset (--offset)")
+            raise InputError(f"has unsigned samples ({dtype.name}); remove input.offset (--offset)")
         return None
     if dtype.kind == "i" and dtype.itemsize in (1, 2, 4):
         unsigned, top = f"uint{8 * dtype.itemsize}", 1 << (8 * dtype.itemsize - 1)
         if wanted not in (None, unsigned) or (settings.offset or 0) > top:
             raise InputError(
-                f"{path}: has {dtype.name} samples, read as {unsigned} with an offset of at most {top} DN; "
-                "correct input.dtype or input.offset"
+                f"has {dtype.name} samples, read as {unsigned} with an offset of at most {top} DN; correct "
+                "input.dtype or input.offset"
             )
         if settings.offset is not None or wanted is not None:
             return settings.offset or 0
         raise InputError(
-            f"{path}: signed samples ({dtype.name}); if none is negative, set input.dtype: {unsigned} "
-            f"(--dtype {unsigned}); if 0 DN is stored as -{top}, set input.offset: {top} (--offset {top})"
+            f"signed samples ({dtype.name}); if none is negative, set input.dtype: {unsigned} (--dtype "
+            f"{unsigned}); if 0 DN is stored as -{top}, set input.offset: {top} (--offset {top})"
         )
     if dtype.kind in "fc":
         raise InputError(
-            f"{path}: floating-point samples ({dtype.name}); raw integer digital numbers (uint8, uint16, "
-            "uint32) are needed, before any correction or averaging"
+            f"floating-point samples ({dtype.name}); raw integer digital numbers (uint8, uint16, uint32) are "
+            "needed, before any correction or averaging"
         )
     if dtype.kind in "OV" or dtype.hasobject:
-        raise InputError(f"{path}: objects instead of numbers; save a plain array of uint8, uint16 or uint32")
-    raise InputError(f"{path}: samples of type {dtype.name}; uint8, uint16 or uint32 are needed")
+        raise InputError("objects instead of numbers; save a plain array of uint8, uint16 or uint32")
+    raise InputError(f"samples of type {dtype.name}; uint8, uint16 or uint32 are needed")
 
 
-def stack_shape(path: Path, shape: Sequence[int], what: str) -> tuple[int, int, int]:
+def stack_shape(shape: Sequence[int], what: str) -> tuple[int, int, int]:
     """Return (frames, rows, columns) of an array; the axes before rows and columns are counted in turn.
 
     Raises:
@@ -86,39 +83,49 @@ def stack_shape(path: Path, shape: Sequence[int], what: str) -> tuple[int, int, 
     """
     sizes = list(shape)
     if min(sizes, default=0) < 0 or max(sizes[-2:], default=0) > _MOST_PIXELS:
-        raise InputError(f"{path}: damaged header: {what} of shape {tuple(shape)}; copy the file again")
+        raise InputError(f"damaged header: {what} of shape {tuple(shape)}; copy the file again")
     if len(sizes) < 2:
-        raise InputError(f"{path}: {what} of shape {tuple(shape)}; needed: (frames, rows, columns)")
+        raise InputError(f"{what} of shape {tuple(shape)}; needed: (frames, rows, columns)")
     n = math.prod(sizes[:-2])
     if n != 1 and sizes[-1] in (3, 4) and len(sizes) > 3:
         raise InputError(
-            f"{path}: {what} of shape {tuple(shape)} looks like colour images; monochrome frames are needed"
+            f"{what} of shape {tuple(shape)} looks like colour images; monochrome frames are needed"
         )
     return n, sizes[-2], sizes[-1]
 
 
-def axes_notes(path: Path, shape: Sequence[int]) -> tuple[str, ...]:
+def axes_notes(shape: Sequence[int]) -> tuple[str, ...]:
     """Return a remark where several axes of an array are read as frames."""
     leading = [str(size) for size in shape[:-2] if size != 1]
     if len(leading) < 2:
         return ()
     return (
-        f"{path.name}: array of shape {tuple(shape)} read as {' x '.join(leading)} frames; if one of these "
-        "axes is colours or channels, write one channel as (frames, rows, columns)",
+        f"array of shape {tuple(shape)} read as {' x '.join(leading)} frames; if one of these axes is "
+        "colours or channels, write one channel as (frames, rows, columns)",
     )
 
 
-def mosaic_note(path: Path, pattern: str) -> str:
+def channel_notes(channels: int, images: int) -> list[str]:
+    """Say that images called channels are read as frames; refuse those that have another axis, too."""
+    if channels < 2 or images < 2:
+        return []
+    if images > channels:
+        raise InputError(
+            f"its metadata describe the {images} images as {channels} channels of {images // channels}; "
+            "write each channel by itself"
+        )
+    return [f"its metadata describe the images as {channels} channels; read as frames"]
+
+
+def mosaic_note(pattern: str) -> str:
     """Return the remark on a sensor whose pixels lie behind filters of several colours."""
     return (
-        f"{path.name}: colour mosaic ({pattern}): read as the monochrome samples of its pixels, each of "
-        "which sees one colour"
+        f"colour mosaic ({pattern}): read as the monochrome samples of its pixels, each of which sees one "
+        "colour"
     )
 
 
-def check_coded(
-    path: Path, shape: tuple[int, int, int], piece: Sequence[int], itemsize: int, size: int
-) -> None:
+def check_coded(shape: tuple[int, int, int], piece: Sequence[int], itemsize: int, size: int) -> None:
     """Check that frames coded in pieces of a shape can be in ``size`` bytes, before memory is taken for them.
 
     Raises:
@@ -127,16 +134,16 @@ def check_coded(
     total, one = math.prod(shape) * itemsize, math.prod(piece) * itemsize
     if total > max(_MOST_CODED, _MOST_RATIO * size):
         raise InputError(
-            f"{path}: damaged header: {size} bytes cannot hold {shape[0]} frames of {shape[1]} x {shape[2]}; "
-            "copy the file again"
+            f"damaged header: {size} bytes cannot hold {shape[0]} frames of {shape[1]} x {shape[2]}; copy "
+            "the file again"
         )
     if one > max(MOST_PIECE, 4 * total):
         raise InputError(
-            f"{path}: damaged header: pieces of {' x '.join(map(str, piece))} samples; copy the file again"
+            f"damaged header: pieces of {' x '.join(map(str, piece))} samples; copy the file again"
         )
 
 
-def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: Sequence[str]) -> None:
+def check_unpacked_size(pieces: Iterable[bytes], expected: int, codecs: Sequence[str]) -> None:
     """Check that coded pieces hold no more than the expected bytes, before the library unpacks them whole.
 
     Of the codecs in use those that do not compress are ignored.
@@ -146,14 +153,12 @@ def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, code
     """
     used = [codec for codec in codecs if codec in _COMPRESSING]
     if len(used) > 1:
-        raise InputError(
-            f"{path}: compressed twice, by {' and '.join(used)}; write it again with one of them"
-        )
+        raise InputError(f"compressed twice, by {' and '.join(used)}; write it again with one of them")
     for data in pieces if used else ():
         if _unpacked_size(data, used[0], expected) > expected:
             raise InputError(
-                f"{path}: damaged: a piece of {len(data)} bytes unpacks to more than the {expected} of its "
-                "shape; copy it again"
+                f"damaged: a piece of {len(data)} bytes unpacks to more than the {expected} of its shape; "
+                "copy it again"
             )
 
 
@@ -213,7 +218,7 @@ def windows(
         start = end
 
 
-def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
+def choose_dataset(shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
     """Return the dataset to read: the wanted one, else the only one of three axes or more, else of two.
 
     Raises:
@@ -228,11 +233,11 @@ def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: st
         if name in shapes:
             return name
         raise InputError(
-            f"{path}: no dataset {wanted!r}, only: {listed or 'no images'}; correct input.dataset (--dataset)"
+            f"no dataset {wanted!r}, only: {listed or 'no images'}; correct input.dataset (--dataset)"
         )
     candidates = stacks or images
     if not candidates:
-        raise InputError(f"{path}: no dataset of frames (frames, rows, columns); omit it")
+        raise InputError("no dataset of frames (frames, rows, columns); omit it")
     if len(candidates) > 1:
-        raise InputError(f"{path}: several datasets: {listed}; choose one with input.dataset (--dataset)")
+        raise InputError(f"several datasets: {listed}; choose one with input.dataset (--dataset)")
     return candidates[0]

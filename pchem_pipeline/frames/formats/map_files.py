@@ -17,9 +17,6 @@ from pchem_pipeline.base.errors import InputError, require
 from pchem_pipeline.frames.formats.fits_files import FitsImage, image_cards, write_images
 from pchem_pipeline.store.files import whole_file
 
-#: bytes above which a TIFF file needs offsets of 64 bits
-_LARGEST_TIFF = 1 << 32
-
 
 @dataclass(frozen=True)
 class MapImage:
@@ -100,7 +97,8 @@ def write_tiff_cube(
     n, rows, columns = shape
     size = n * rows * columns * dtype.itemsize
     with whole_file(path) as part:
-        if size + (1 << 25) < _LARGEST_TIFF and dtype.str[1:] in ("u1", "u2", "f4"):
+        # beyond this a TIFF file needs offsets of 64 bits
+        if size + (1 << 25) < 1 << 32 and dtype.str[1:] in ("u1", "u2", "f4"):
             frames = {"axes": "TZCYXS", "Info": json.dumps(about), "unit": "pixel"}
             # all axes: a last one of one column would be taken for samples of a pixel
             options = {"shape": (n, 1, 1, rows, columns, 1), "dtype": dtype, "photometric": "minisblack"}

@@ -30,23 +30,20 @@ class NpyReader(ContiguousReader):
             old = version == (1, 0)
             read = npy_format.read_array_header_1_0 if old else npy_format.read_array_header_2_0
             shape, fortran, dtype = read(stream)
-            start, size = stream.tell(), path.stat().st_size
+            start = stream.tell()
         if dtype.hasobject:
             raise InputError(
-                f"{path}: an object array (pickles are never opened); save a plain array of uint8, uint16 or "
-                "uint32"
+                "an object array (pickles are never opened); save a plain array of uint8, uint16 or uint32"
             )
-        self.set_stack(path, shape, dtype, settings, "array")
+        self.set_stack(shape, dtype, settings, "array")
         n, rows, columns = self.shape
         if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
-            raise InputError(
-                f"{path}: Fortran order; save it with numpy.save(..., numpy.ascontiguousarray(frames))"
-            )
-        offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
-        self.set_layout(path, Layout(offsets, rows, columns, dtype, self._offset), size)
-        behind = size - max(start, self._layout.end)
+            raise InputError("Fortran order; save it with numpy.save(..., numpy.ascontiguousarray(frames))")
+        offsets = even_offsets(n, rows * columns * dtype.itemsize, self.size, start=start)
+        self.set_layout(Layout(offsets, rows, columns, dtype, self._offset))
+        behind = self.size - max(start, self._layout.end)
         if behind:
-            self.notes = (f"{path.name}: {behind} bytes after the array are ignored",)
+            self.notes = (f"{behind} bytes after the array are ignored",)
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:

@@ -27,7 +27,7 @@ from pchem_pipeline.frames.formats.kinds import check_samples
 from pchem_pipeline.frames.formats.packing import PACKINGS
 from pchem_pipeline.frames.settings import InputSettings, PackingName
 from pchem_pipeline.frames.writing import StackFacts
-from pchem_pipeline.store.files import whole_file
+from pchem_pipeline.store.files import write_atomic
 
 #: suffixes of descriptions beside raw files
 SIDECARS = (".json", ".yaml", ".yml", ".inf")
@@ -38,8 +38,6 @@ _NAMES_IN_INF = {
     "gain": "EMCCD Gain",
     "binning": "binning",
 }
-#: keys that only samples without packing have
-_UNPACKED = ("dtype", "offset", "byte_order")
 #: factor between the steps of samples from frame to frame by which another packing is told
 _CLEARLY = 4
 
@@ -78,14 +76,10 @@ def _read_sidecar(path: Path) -> _Sidecar:
         readers: dict[str, Callable[[str], Any]] = {".json": json.loads, ".inf": _from_inf}
         return _Sidecar.model_validate(readers.get(found.suffix, yaml.safe_load)(text))
     except ValidationError as error:
-        raise InputError(
-            f"{path}: sidecar {found.name}: {error_words(error)}; correct the sidecar"
-        ) from error
+        raise InputError(f"sidecar {found.name}: {error_words(error)}; correct the sidecar") from error
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         words = "not valid YAML" if isinstance(error, yaml.YAMLError) else error
-        raise InputError(
-            f"{path}: sidecar {found.name} cannot be read ({words}); correct the sidecar"
-        ) from error
+        raise InputError(f"sidecar {found.name} cannot be read ({words}); correct the sidecar") from error
 
 
 def _from_inf(text: str) -> dict[str, Any]:
@@ -112,64 +106,62 @@ class RawReader(ContiguousReader):
         facts = {name: getattr(settings, name, None) for name in _Sidecar.model_fields}
         facts = {name: getattr(side, name) if value is None else value for name, value in facts.items()}
         if facts["packing"] is not None:
-            if extra := [name for name in _UNPACKED if facts[name] is not None]:
+            if extra := [name for name in ("dtype", "offset", "byte_order") if facts[name] is not None]:
                 raise InputError(
-                    f"{path}: packing {facts['packing']} says what the samples are; remove "
-                    f"{' and '.join(extra)} from the section input or the sidecar"
+                    f"packing {facts['packing']} says what the samples are; remove {' and '.join(extra)} "
+                    "from the section input or the sidecar"
                 )
             depth = facts["bit_depth"] or PACKINGS[facts["packing"]].bits
             facts |= {"dtype": "uint16", "bit_depth": depth}
         if facts["shape"] is None or facts["dtype"] is None:
             missing = " and ".join(f"input.{name}" for name in ("shape", "dtype") if facts[name] is None)
-            raise InputError(
-                f"{path}: raw frames need {missing}; set this, or write a sidecar {path.name}.json"
-            )
+            raise InputError(f"raw frames need {missing}; set this, or write a sidecar {path.name}.json")
         self.bit_shift = facts["bit_shift"] or 0
-        self.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
+        self.take_facts(*facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
         self._lay_out(path, facts)
 
     def _lay_out(self, path: Path, facts: dict[str, Any]) -> None:
         shape, header, padding = facts["shape"], facts["header_bytes"] or 0, facts["frame_padding_bytes"] or 0
         if len(shape) not in (2, 3) or min(shape) < 1 or header < 0 or padding < 0:
             raise InputError(
-                f"{path}: shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} are "
-                "invalid; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
+                f"shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} are invalid; "
+                "shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
             )
         self.byte_order = facts["byte_order"] or "little"
         stored = np.dtype(facts["dtype"])
         if facts["offset"] is not None:
             stored = np.dtype(f"i{stored.itemsize}")
-        offset = check_samples(path, stored, InputSettings(offset=facts["offset"]))
+        offset = check_samples(stored, InputSettings(offset=facts["offset"]))
         stored = stored.newbyteorder(self.byte_order)
         rows, columns = shape[-2:]
         packing, what = PACKINGS.get(facts["packing"]), "packing" if facts["packing"] else "dtype"
         layout = Layout(np.empty(0, np.int64), rows, columns, stored, offset, packing)
         if packing is not None and rows * columns % len(packing.places):
             raise InputError(
-                f"{path}: frames of {rows} x {columns} samples are no whole bytes as {facts['packing']} "
-                f"(groups of {len(packing.places)}); correct input.shape or input.packing"
+                f"frames of {rows} x {columns} samples are no whole bytes as {facts['packing']} (groups of "
+                f"{len(packing.places)}); correct input.shape or input.packing"
             )
         frame = layout.frame_bytes
         step = frame + padding
-        size = path.stat().st_size
+        size = self.size
         whole, rest = divmod(size - header, step) if size >= header else (0, size)
         if rest == frame:  # the padding of the last frame may be missing
             whole, rest = whole + 1, 0
         n = shape[0] if len(shape) == 3 else whole
         if len(shape) == 2 and (rest or whole == 0):
             raise InputError(
-                f"{path}: truncated, or not {rows} x {columns} {facts[what]}: {size} bytes = header of "
-                f"{header} + {whole} frames of {step} + {rest}; copy the file again, or correct input.shape, "
+                f"truncated, or not {rows} x {columns} {facts[what]}: {size} bytes = header of {header} + "
+                f"{whole} frames of {step} + {rest}; copy the file again, or correct input.shape, "
                 f"input.{what}, input.header_bytes or input.frame_padding_bytes"
             )
         if n < whole:
-            self.notes = (f"{path.name} has {whole} frames; the first {n} are used (shape)",)
-        offsets = even_offsets(path, n, frame, size, start=header, step=step)
-        self.set_layout(path, replace(layout, offsets=offsets), size)
+            self.notes = (f"has {whole} frames; the first {n} are used (shape)",)
+        offsets = even_offsets(n, frame, size, start=header, step=step)
+        self.set_layout(replace(layout, offsets=offsets))
         if packing is not None:
-            self._check_packing(path, facts["packing"])
+            self._check_packing(facts["packing"])
 
-    def _check_packing(self, path: Path, name: str) -> None:
+    def _check_packing(self, name: str) -> None:
         """Refuse samples that change far less from frame to frame with their bytes read in another order."""
         layout, steps = self._layout, {}
         for other, packing in PACKINGS.items():
@@ -182,7 +174,7 @@ class RawReader(ContiguousReader):
         self._layout = layout
         best = min(steps, key=lambda each: steps[each])
         if steps[name] > _CLEARLY * steps[best]:
-            raise InputError(f"{path}: the samples look like {best}; correct input.packing")
+            raise InputError(f"the samples look like {best}; correct input.packing")
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
@@ -190,5 +182,4 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
     write_plain(path, b"", blocks, stack.dtype.newbyteorder("<"))
     record: dict[str, Any] = {"shape": stack.shape, "dtype": stack.dtype.name}
     record |= {"byte_order": "little", "header_bytes": 0, **stack.stated}
-    with whole_file(path.with_name(path.name + ".json")) as part:
-        part.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    write_atomic(path.with_name(path.name + ".json"), (json.dumps(record) + "\n").encode())

@@ -41,28 +41,24 @@ class SerReader(ContiguousReader):
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
-            head, size = stream.read(_HEADER.size), path.stat().st_size
+            head = stream.read(_HEADER.size)
         if not head.startswith(_MAGIC):
             raise ValueError
         _, _, colour, flag, columns, rows, depth, n, _, instrument, _, _, ticks = _HEADER.unpack(head)
         if colour in _MOSAICS:
-            self.notes = (mosaic_note(path, _MOSAICS[colour]),)
+            self.notes = (mosaic_note(_MOSAICS[colour]),)
         elif colour != 0:
-            raise InputError(
-                f"{path}: colour video (ColorID {colour}); record raw frames (monochrome or Bayer)"
-            )
+            raise InputError(f"colour video (ColorID {colour}); record raw frames (monochrome or Bayer)")
         if not 1 <= depth <= 16 or rows < 1 or columns < 1 or n < 0:
-            raise InputError(
-                f"{path}: damaged header ({n} frames, {rows} x {columns}, {depth} bits); copy it again"
-            )
+            raise InputError(f"damaged header ({n} frames, {rows} x {columns}, {depth} bits); copy it again")
         order = settings.byte_order or ("big" if flag else "little")
         stored = np.dtype("u1" if depth <= 8 else "u2").newbyteorder(order)
-        offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
-        self.set_layout(path, Layout(offsets, rows, columns, stored), size)
+        offsets = even_offsets(n, rows * columns * stored.itemsize, self.size, start=_HEADER.size)
+        self.set_layout(Layout(offsets, rows, columns, stored))
         self.bit_depth, self.byte_order = depth, order
         taken = (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
         end = self._layout.end
-        if n and size >= end + 8 * n:  # there is a trailer of times
+        if n and self.size >= end + 8 * n:  # there is a trailer of times
             times = np.fromfile(path, "<i8", n, offset=end)
             if (times > 0).all():
                 self.timestamps = (times - _EPOCH) * 1e-7

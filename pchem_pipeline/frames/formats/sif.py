@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError, require
-from pchem_pipeline.frames.camera import CameraFacts, StatedFacts, celsius, duration_of, text_of, texts_of
+from pchem_pipeline.frames.camera import CameraFacts, celsius, duration_of, text_of, texts_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -47,12 +47,10 @@ class SifReader(ContiguousReader):
         with _Ending(io.FileIO(path)) as stream:
             _, info = sif_parser.np_open(stream, lazy="memmap")
         if info["NumberOfSubImages"] != 1:
-            raise InputError(
-                f"{path}: {info['NumberOfSubImages']} tracks or areas; record one image per frame"
-            )
+            raise InputError(f"{info['NumberOfSubImages']} tracks or areas; record one image per frame")
         columns, rows = info["size"]
         offsets = np.array([tile[2] for tile in info["tile"]], np.int64)
-        self.set_layout(path, Layout(offsets, rows, columns, np.dtype("<f4")), path.stat().st_size)
+        self.set_layout(Layout(offsets, rows, columns, np.dtype("<f4")))
         taken = float(info["ExperimentTime"])
         setup = {"binning": f"{info['xbin']} x {info['ybin']}", "gain": info["GainDAC"]}
         camera = CameraFacts(
@@ -61,9 +59,9 @@ class SifReader(ContiguousReader):
             taken=taken if taken > 0 else None,
             setup=texts_of(setup, setup),
         )
-        self.take_facts(StatedFacts(camera, duration_of("ExposureTime", info["ExposureTime"], "s")))
+        self.take_facts(camera, duration_of("ExposureTime", info["ExposureTime"], "s"))
         if (sums := info["AccumulatedCycles"]) > 1:
-            self.notes = (f"{path.name}: each frame is the sum of {sums} exposures",)
+            self.notes = (f"each frame is the sum of {sums} exposures",)
         ticks = np.array([info[f"timestamp_of_{t}"] for t in range(len(offsets))], np.int64)  # us
         if self.camera.taken is not None and (np.diff(ticks) > 0).all():
             self.timestamps = self.camera.taken + 1e-6 * ticks.astype(np.float64)

@@ -17,7 +17,7 @@ import numpy as np
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
-    StatedFacts,
+    Stated,
     bits_of,
     celsius,
     duration_of,
@@ -28,7 +28,7 @@ from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, O
 from pchem_pipeline.frames.formats.kinds import check_samples
 from pchem_pipeline.frames.settings import InputSettings
 
-_HEADER_BYTES, _LARGEST_FOOTER = 4100, 1 << 26
+_HEADER_BYTES = 4100
 #: place of a number of the header, and its type
 _FIELDS = {
     "seconds": (10, "<f"),
@@ -52,35 +52,35 @@ class SpeReader(ContiguousReader):
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
-            head, size = stream.read(_HEADER_BYTES), path.stat().st_size
+            head = stream.read(_HEADER_BYTES)
         field = {name: struct.unpack_from(kind, head, place)[0] for name, (place, kind) in _FIELDS.items()}
         if field["samples"] not in _SAMPLES:
             raise InputError(
-                f"{path}: samples of type {field['samples']}; record whole numbers (16 or 32 bits), or "
-                "correct the name if this is no SPE file"
+                f"samples of type {field['samples']}; record whole numbers (16 or 32 bits), or correct the "
+                "name if this is no SPE file"
             )
         stored = np.dtype(_SAMPLES[field["samples"]])
         n, rows, columns, regions = (field[name] for name in ("frames", "rows", "columns", "regions"))
         step, footer = None, None
         if field["version"] >= 3 and field["footer"]:
-            footer = _footer(path, field["footer"], size)
+            footer = _footer(path, field["footer"], self.size)
             frame = next(footer.iterfind(".//{*}DataBlock[@type='Frame']"))
             parts = frame.findall(".//{*}DataBlock[@type='Region']")
             n, step, regions = int(frame.attrib["count"]), int(frame.attrib["stride"]), len(parts)
             rows, columns = (int(parts[0].attrib[name]) for name in ("height", "width"))
         if regions > 1:
-            raise InputError(f"{path}: {regions} regions of interest; record one")
+            raise InputError(f"{regions} regions of interest; record one")
         if rows < 1 or columns < 1 or n < 0:
-            raise InputError(f"{path}: damaged header ({n} frames, {rows} x {columns}); copy it again")
-        offset = None if stored.kind == "f" else check_samples(path, stored, settings)
+            raise InputError(f"damaged header ({n} frames, {rows} x {columns}); copy it again")
+        offset = None if stored.kind == "f" else check_samples(stored, settings)
         frame_bytes = rows * columns * stored.itemsize
-        offsets = even_offsets(path, n, frame_bytes, size, start=_HEADER_BYTES, step=step)
-        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
+        offsets = even_offsets(n, frame_bytes, self.size, start=_HEADER_BYTES, step=step)
+        self.set_layout(Layout(offsets, rows, columns, stored, offset))
         if footer is None:
             duration = duration_of("exp_sec", field["seconds"], "s")
-            self.take_facts(StatedFacts(CameraFacts(temperature=celsius(field["temperature"])), duration))
+            self.take_facts(CameraFacts(temperature=celsius(field["temperature"])), duration)
         else:
-            self.take_facts(_stated_facts(footer))
+            self.take_facts(*_stated_facts(footer))
             self._read_stamps(footer)
 
     def _read_stamps(self, footer: Any) -> None:
@@ -91,9 +91,9 @@ class SpeReader(ContiguousReader):
             places.setdefault(element.get("event") or element.tag.rpartition("}")[2], (at, element))
             at += int(element.get("bitDepth", 0)) // 8
         offsets = self._layout.offsets + self._layout.frame_bytes
-        if not at or not n or int(offsets[-1]) + at > self._size:
+        if not at or not n or int(offsets[-1]) + at > self.size:
             return
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(self.paths[0], self.size) as file:
             data = [file.read_bytes(offset, at) for offset in offsets.tolist()]
         numbers = {
             name: np.array([struct.unpack_from("<q", each, place)[0] for each in data])
@@ -111,24 +111,24 @@ class SpeReader(ContiguousReader):
 
 def _footer(path: Path, start: int, size: int) -> Any:
     """Return the root of the XML behind the frames."""
-    if not _HEADER_BYTES <= start < size or size - start > _LARGEST_FOOTER:
-        raise InputError(f"{path}: truncated before its footer, or a damaged header; copy the file again")
+    if not _HEADER_BYTES <= start < size or size - start > 1 << 26:
+        raise InputError("truncated before its footer, or a damaged header; copy the file again")
     with path.open("rb") as stream:
         stream.seek(start)
         text = stream.read()
     if b"<!DOCTYPE" in text:  # entities can unfold without an end
-        raise InputError(f"{path}: its footer declares entities, which SPE files do not have; copy it again")
+        raise InputError("its footer declares entities, which SPE files do not have; copy it again")
     return ElementTree.fromstring(text)
 
 
-def _stated_facts(footer: Any) -> StatedFacts:
+def _stated_facts(footer: Any) -> Stated:
     """Return what the footer says of the camera and its setting."""
     nothing = ElementTree.Element("none")
     camera, origin = (next(footer.iterfind(f".//{{*}}{name}"), nothing) for name in ("Camera", "Origin"))
     names = {"gain": "AnalogGain", "readout_mode": "Quality"}
     setup = {ours: footer.findtext(f".//{{*}}Adc//{{*}}{name}") for ours, name in names.items()}
     depth = footer.findtext(".//{*}Adc//{*}BitDepth") or ""
-    return StatedFacts(
+    return (
         CameraFacts(
             text_of(camera.get("model")),
             text_of(camera.get("serialNumber")),

@@ -18,16 +18,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.contiguous import (
-    ContiguousReader,
-    Layout,
-    OpenedFile,
-    even_offsets,
-    unsigned_type,
-)
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, mosaic_note
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, OpenedFile, even_offsets
+from pchem_pipeline.frames.formats.kinds import channel_notes, check_coded, mosaic_note
 from pchem_pipeline.frames.formats.tiff_facts import (
-    LINEARIZATION_TAG,
     active_area,
     check_chain,
     images_behind_one_page,
@@ -59,8 +52,7 @@ class TiffReader(ContiguousReader):
         import tifffile
 
         logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
-        size = path.stat().st_size
-        check_chain(path, size)
+        check_chain(path, self.size)
         with tifffile.TiffFile(path) as file:
             every = [*file.pages]
             pages = [page for page in every if not page.is_reduced]
@@ -70,45 +62,43 @@ class TiffReader(ContiguousReader):
             reduced = len(every) - len(pages)
             if not pages:
                 raise ValueError("no pages")
-            notes = [f"{path.name}: {reduced} reduced pages (previews) are ignored"] if reduced else []
+            notes = [f"{reduced} reduced pages (previews) are ignored"] if reduced else []
             first = pages[0]
-            _check_pages(path, pages)
-            offset = check_samples(path, np.dtype(first.dtype), settings)
+            _check_pages(pages)
+            self.set_stack((len(pages), *first.shape[-2:]), np.dtype(first.dtype), settings, "pages")
             count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
-            notes += _channel_notes(path, *stated_channels(file), count) + _value_notes(path, pages)
+            channels, images = stated_channels(file)
+            notes += channel_notes(channels, images if images == count else min(count, channels))
+            notes += _value_notes(pages)
             self.notes = tuple(notes)
             stored = np.dtype(first.dtype).newbyteorder(file.byteorder)
-            offsets = _contiguous_offsets(path, file, pages, size)
+            offsets = _contiguous_offsets(file, pages, self.size)
             rows, columns = first.shape[-2:]
             if offsets is not None:
-                self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
+                self.set_layout(Layout(offsets, rows, columns, stored, self._offset))
             else:
-                self._set_coded(path, pages, size, offset)
-            self.take_facts(stated_facts(file, first))
+                self._set_coded(pages)
+            self.take_facts(*stated_facts(file, first))
             self.active = active_area(first)
 
-    def _set_coded(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
+    def _set_coded(self, pages: Sequence[Any]) -> None:
         """Remember where the pages are, after a look at where their strips or tiles are."""
-        broken = [page for page in pages if _reaches_beyond(page, size)]
+        broken = [page for page in pages if _reaches_beyond(page, self.size)]
         if broken:
             raise InputError(
-                f"{path}: truncated: {len(broken)} of {len(pages)} pages extend beyond the end of the file "
-                f"({size} bytes); copy the file again"
+                f"truncated: {len(broken)} of {len(pages)} pages extend beyond the end of the file "
+                f"({self.size} bytes); copy the file again"
             )
-        rows, columns = pages[0].shape
         piece = max((page.chunks for page in pages), key=math.prod)
-        stored = np.dtype(pages[0].dtype)
-        check_coded(path, (len(pages), rows, columns), piece, stored.itemsize, size)
-        self.paths, self.shape, self.dtype = (path,), (len(pages), rows, columns), unsigned_type(stored)
-        self._size, self._offset = size, offset
-        self.rows_per_read = min(rows, max(page.chunks[0] for page in pages))
+        check_coded(self.shape, piece, self.dtype.itemsize, self.size)
+        self.rows_per_read = min(self.shape[1], max(page.chunks[0] for page in pages))
         self._places = np.array([page.offset for page in pages], np.int64)
 
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import tifffile
 
         path = self.paths[0]
-        with OpenedFile(path, self._size) as file, tifffile.TiffFile(path) as known:
+        with OpenedFile(path, self.size) as file, tifffile.TiffFile(path) as known:
             for t in range(t0, t1):
                 known.filehandle.seek(int(self._places[t]))
                 page = tifffile.TiffPage(known, t)
@@ -117,9 +107,7 @@ class TiffReader(ContiguousReader):
                 except InputError:
                     raise
                 except Exception as error:
-                    raise InputError(
-                        f"{path}: page {t} cannot be decoded ({error}); copy the file again"
-                    ) from error
+                    raise InputError(f"page {t} cannot be decoded ({error}); copy the file again") from error
 
 
 def _reaches_beyond(page: Any, size: int) -> bool:
@@ -145,80 +133,66 @@ def _decode(page: Any, file: OpenedFile, frame: NDArray[Any], y0: int, y1: int) 
             target[...] = segment[0, low - top : high - top, : target.shape[1], 0]
 
 
-def _channel_notes(path: Path, channels: int, images: int, pages: int) -> list[str]:
-    """Say that pages called channels are read as frames; refuse those that have another axis, too."""
-    if channels < 2 or pages < 2:
-        return []
-    if images == pages > channels:
-        raise InputError(
-            f"{path}: its metadata describe the {pages} pages as {channels} channels of {pages // channels} "
-            "images; write one file per channel"
-        )
-    return [f"{path.name}: its metadata describe the pages as {channels} channels; read as frames"]
-
-
-def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
+def _value_notes(pages: Sequence[Any]) -> list[str]:
     """Say where samples may not be what the camera delivered: planes, lost in coding, unwritten, inverted."""
     notes = []
     if (planes := pages[0].samplesperpixel) > 1:
-        notes.append(f"{path.name}: the {planes} planes of its page are read as frames")
+        notes.append(f"the {planes} planes of its page are read as frames")
     names = {getattr(page.compression, "name", "") for page in pages}
     lossy = [name for name in names if any(word in name for word in _LOSSY)]
     if lossy:
         notes.append(
-            f"{path.name}: {', '.join(sorted(lossy))} compression can be lossy; noise and histograms may be "
-            "altered"
+            f"{', '.join(sorted(lossy))} compression can be lossy; noise and histograms may be altered"
         )
     counts = [count for page in pages for count in page.databytecounts]
-    notes += unwritten_notes(path, counts.count(0), len(counts), "strips or tiles")
+    notes += unwritten_notes(counts.count(0), len(counts), "strips or tiles")
     if pattern := mosaic(pages[0]):
-        notes.append(mosaic_note(path, pattern))
-    if LINEARIZATION_TAG in pages[0].tags:
+        notes.append(mosaic_note(pattern))
+    if "LinearizationTable" in pages[0].tags:
         notes.append(
-            f"{path.name}: its samples are codes of a table (LinearizationTable), not proportional to light; "
-            "read as stored"
+            "its samples are codes of a table (LinearizationTable), not proportional to light; read as stored"
         )
     if getattr(pages[0].photometric, "name", "") == "MINISWHITE":
         notes.append(
-            f"{path.name}: its tags declare 0 as white; samples are read as stored: if more light lowers "
-            "them, invert them first"
+            "its tags declare 0 as white; samples are read as stored: if more light lowers them, invert them "
+            "first"
         )
     return notes
 
 
-def _check_pages(path: Path, pages: Sequence[Any]) -> None:
+def _check_pages(pages: Sequence[Any]) -> None:
     """Refuse colour, pages of different shape or type, and pages that were not written to their end."""
     first = pages[0]
     for number, page in enumerate(pages):
         if page.dtype is None or not all(isinstance(length, int) for length in page.shape):
             raise InputError(
-                f"{path}: page {number}: unknown sample type or damaged header; write it as uint8 or uint16"
+                f"page {number}: unknown sample type or damaged header; write it as uint8 or uint16"
             )
         if (page.shape, page.dtype) != (first.shape, first.dtype):
             raise InputError(
-                f"{path}: page {number} is {_words(page)}, page 0 is {_words(first)}; all frames must have "
-                "the same shape and type"
+                f"page {number} is {_words(page)}, page 0 is {_words(first)}; all frames must have the same "
+                "shape and type"
             )
     photometric = first.photometric.name if hasattr(first.photometric, "name") else str(first.photometric)
     planes = first.samplesperpixel
     separate = planes > 1 and int(first.planarconfig) == 2 and photometric.startswith("MINIS")
     if photometric not in _MONOCHROME or (planes > 1 and not separate):
         raise InputError(
-            f"{path}: colour or multi-channel images ({photometric}, {planes} samples per pixel); monochrome "
-            "raw frames are needed"
+            f"colour or multi-channel images ({photometric}, {planes} samples per pixel); monochrome raw "
+            "frames are needed"
         )
     if len(first.shape) > (2 if planes == 1 else 3):
-        raise InputError(f"{path}: pages of {_words(first)} are volumes; write one frame per page")
+        raise InputError(f"pages of {_words(first)} are volumes; write one frame per page")
     if planes > 1 and len(pages) > 1:
-        raise InputError(f"{path}: {len(pages)} pages of {planes} planes each; write one frame per page")
+        raise InputError(f"{len(pages)} pages of {planes} planes each; write one frame per page")
     if planes > 1 and int(first.compression) != 1:
-        raise InputError(f"{path}: one page of {planes} compressed planes; write one frame per page")
+        raise InputError(f"one page of {planes} compressed planes; write one frame per page")
     for number, page in enumerate(pages):
         offsets, counts = len(page.dataoffsets), len(page.databytecounts)
         if offsets != counts or offsets < math.prod(page.chunked):
             raise InputError(
-                f"{path}: page {number} has {offsets} strips or tiles and {counts} sizes, "
-                f"{math.prod(page.chunked)} needed: incomplete file; copy or write it again"
+                f"page {number} has {offsets} strips or tiles and {counts} sizes, {math.prod(page.chunked)} "
+                "needed: incomplete file; copy or write it again"
             )
 
 
@@ -226,7 +200,7 @@ def _words(page: Any) -> str:
     return f"{' x '.join(str(size) for size in page.shape)} {page.dtype.name}"
 
 
-def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) -> IntArray | None:
+def _contiguous_offsets(file: Any, pages: Sequence[Any], size: int) -> IntArray | None:
     """Return the offset of each frame if all are stored plainly, else None."""
     itemsize, planes = np.dtype(pages[0].dtype).itemsize, pages[0].samplesperpixel
     frame = math.prod(pages[0].shape[-2:]) * itemsize
@@ -240,7 +214,7 @@ def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) 
             return None
     starts = np.array([page.dataoffsets[0] for page in pages], np.int64)
     if len(pages) == 1 and planes == 1:
-        return even_offsets(path, images_behind_one_page(file), frame, size, start=int(starts[0]))
+        return even_offsets(images_behind_one_page(file), frame, size, start=int(starts[0]))
     offsets: IntArray = np.add.outer(starts, frame * np.arange(planes)).ravel()
     return offsets
 

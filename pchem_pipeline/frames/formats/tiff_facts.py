@@ -14,7 +14,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
     Duration,
-    StatedFacts,
+    Stated,
     agreed_duration,
     bits_of,
     celsius,
@@ -29,13 +29,8 @@ from pchem_pipeline.frames.settings import Area
 #: tags of a directory, as in tifffile
 _MOST_TAGS = 4096
 _MOST_PAGES = 100_000
-_EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
-_MICRO_MANAGER_TAG = 51123
-_STK_PLANES_TAG = 33629
-_CFA_PATTERN_TAG, LINEARIZATION_TAG, _ACTIVE_AREA_TAG = 33422, 50712, 50829
-#: colours of a mosaic by their numbers; most pixels of its pattern
-_COLOURS, _LARGEST_MOSAIC = "RGBCMYW", 36
-_MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
+#: colours of a mosaic by their numbers
+_COLOURS = "RGBCMYW"
 
 
 def check_chain(path: Path, size: int) -> None:
@@ -57,12 +52,10 @@ def check_chain(path: Path, size: int) -> None:
         seen: set[int] = set()
         while following:
             if len(seen) > _MOST_PAGES:
-                raise InputError(
-                    f"{path}: more than {_MOST_PAGES} pages; write several files, or an npy array"
-                )
+                raise InputError(f"more than {_MOST_PAGES} pages; write several files, or an npy array")
             if following in seen:
                 raise InputError(
-                    f"{path}: damaged: after {len(seen)} pages the list of pages is circular; copy it again"
+                    f"damaged: after {len(seen)} pages the list of pages is circular; copy it again"
                 )
             seen.add(following)
             stream.seek(following)
@@ -70,18 +63,17 @@ def check_chain(path: Path, size: int) -> None:
             stream.seek(following + count_bytes + min(tags, _MOST_TAGS) * tag_bytes)
             data = stream.read(pointer)
             if tags > _MOST_TAGS or len(data) < pointer:
-                raise _broken_chain(path, len(seen) - 1, size)
+                raise _broken_chain(len(seen) - 1, size)
             following = int.from_bytes(data, order)
         if not seen:
-            raise _broken_chain(path, 0, size)
+            raise _broken_chain(0, size)
 
 
-def _broken_chain(path: Path, pages: int, size: int) -> InputError:
+def _broken_chain(pages: int, size: int) -> InputError:
     if not pages:
-        return InputError(f"{path}: not a valid tiff file, or truncated (no pages); copy it again")
+        return InputError("not a valid tiff file, or truncated (no pages); copy it again")
     return InputError(
-        f"{path}: truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it "
-        "again"
+        f"truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it again"
     )
 
 
@@ -90,8 +82,8 @@ def images_behind_one_page(file: Any) -> int:
     if file.is_imagej and file.imagej_metadata:
         return max(1, int(file.imagej_metadata.get("images", 1)))
     tags = file.pages[0].tags
-    if _STK_PLANES_TAG in tags:
-        return max(1, int(tags[_STK_PLANES_TAG].count))
+    if "UIC2tag" in tags:
+        return max(1, int(tags["UIC2tag"].count))
     record = _shaped(file)
     return math.prod(record["shape"][:-2]) if record.get("truncated") else 1
 
@@ -125,49 +117,49 @@ def stated_channels(file: Any) -> tuple[int, int]:
     return sizes[0], math.prod(sizes)
 
 
-def stated_facts(file: Any, page: Any) -> StatedFacts:
+def stated_facts(file: Any, page: Any) -> Stated:
     """Return what our own JSON, OME-XML, Micro-Manager or tags say of frames that are like a page."""
     head = file.pages[0]
-    own = facts_from_names(_shaped(file))
-    record = _tag(head, _MICRO_MANAGER_TAG)
+    own_camera, own_duration, own_depth = facts_from_names(_shaped(file))
+    record = _tag(head, "MicroManagerMetadata")
     record = record if isinstance(record, dict) else {}
     hot = next((value for name, value in record.items() if name.endswith("Temperature")), None)
     cameras = (
-        own.camera,
+        own_camera,
         _ome_camera(_ome(file)),
         CameraFacts(
             text_of(record.get("Camera")), temperature=celsius(hot), taken=seconds_of(record.get("Time"))
         ),
-        CameraFacts(_make_and_model(head), taken=seconds_of(_tag(head, _DATE_TAG))),
+        CameraFacts(_make_and_model(head), taken=seconds_of(_tag(head, "DateTime"))),
     )
     times = (
-        own.duration,
+        own_duration,
         _ome_time(_ome(file)),
-        _ratio(_tag(head, _EXPOSURE_TAG)),
-        _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(head, _EXIF_TAG), dict) else None,
+        _ratio(_tag(head, "ExposureTime")),
+        _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(head, "ExifTag"), dict) else None,
         duration_of("Exposure-ms", record.get("Exposure-ms"), "ms"),
     )
     bits = page.bitspersample  # which say nothing where they are those of a whole type
     significant = re.search(r'SignificantBits="(\d+)"', _ome(file))
     stated = bits_of(int(significant[1])) if significant else None
-    depths = (stated, own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
+    depths = (stated, own_depth, None if bits in (8, 16, 32) else bits_of(bits))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
-    return StatedFacts(camera, agreed_duration(times), first_of(depths))
+    return camera, agreed_duration(times), first_of(depths)
 
 
 def mosaic(page: Any) -> str:
     """Return the colours of a mosaic from left to right and top to bottom; empty where there is none."""
     if getattr(page.photometric, "name", "") != "CFA":
         return ""
-    pattern = bytes(_tag(page, _CFA_PATTERN_TAG) or b"")[:_LARGEST_MOSAIC]
+    pattern = bytes(_tag(page, "CFAPattern") or b"")[:36]
     return "".join(_COLOURS[each] for each in pattern if each < len(_COLOURS)) or "CFA"
 
 
 def active_area(page: Any) -> Area | None:
     """Return the light-sensitive part of a DNG, see `FrameReader.active`; None where it says none."""
     rows, columns = page.shape[-2:]
-    top, left, bottom, right = _tag(page, _ACTIVE_AREA_TAG) or (0, 0, 0, 0)
+    top, left, bottom, right = _tag(page, "ActiveArea") or (0, 0, 0, 0)
     inside = 0 <= top < bottom <= rows and 0 <= left < right <= columns
     return (top, bottom, left, right) if inside else None
 
@@ -202,11 +194,11 @@ def _attribute(element: re.Match[str] | None, name: str) -> str | None:
 
 
 def _make_and_model(page: Any) -> str | None:
-    make, model = text_of(_tag(page, _MAKE_TAG)), text_of(_tag(page, _MODEL_TAG))
+    make, model = text_of(_tag(page, "Make")), text_of(_tag(page, "Model"))
     if make and model and model.lower().startswith(make.lower()):
         return model
     return " ".join(part for part in (make, model) if part) or None
 
 
-def _tag(page: Any, number: int) -> Any:
-    return page.tags[number].value if number in page.tags else None
+def _tag(page: Any, name: str) -> Any:
+    return page.tags[name].value if name in page.tags else None

@@ -17,6 +17,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import (
+    channel_notes,
     check_coded,
     check_unpacked_size,
     choose_dataset,
@@ -25,7 +26,7 @@ from pchem_pipeline.frames.formats.kinds import (
     windows,
 )
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import changed, unwritten_notes
+from pchem_pipeline.frames.reader import unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
@@ -56,14 +57,12 @@ class ZarrReader(ContiguousReader):
         import zarr
 
         if link := link_out_of(path):
-            raise InputError(f"{path}: {link} is a link out of the store; copy its files into the store")
+            raise InputError(f"{link} is a link out of the store; copy its files into the store")
         parts = [*path.rglob("*")]
         if special := next((part for part in parts if not (part.is_file() or part.is_dir())), None):
-            raise InputError(
-                f"{path}: {special.relative_to(path)} is not a regular file; copy the store again"
-            )
+            raise InputError(f"{special.relative_to(path)} is not a regular file; copy the store again")
         if max((len(part.relative_to(path).parts) for part in parts), default=0) > _DEEPEST:
-            raise InputError(f"{path}: groups nested more than {_DEEPEST} deep; copy the array out of them")
+            raise InputError(f"groups nested more than {_DEEPEST} deep; copy the array out of them")
         node = zarr.open(path, mode="r")
         if isinstance(node, zarr.Array):
             array: Any = node
@@ -71,38 +70,36 @@ class ZarrReader(ContiguousReader):
         else:
             scales = _scales(node) if settings.dataset is None else None
             full = scales and str(scales[0]["datasets"][0]["path"])  # the first level (0.5 and before)
-            self._name = full or choose_dataset(path, _shapes(node), settings.dataset)
+            self._name = full or choose_dataset(_shapes(node), settings.dataset)
             array = node[self._name]
             attributes = {**node.attrs, **array.attrs}
         from pchem_pipeline.store.zarr_store import foreign_codecs
 
         if foreign := foreign_codecs(array):
             raise InputError(
-                f"{path}: {self._name or 'the array'} is encoded by {', '.join(foreign)}, which may run "
-                "code; write it again with blosc, gzip or zstd"
+                f"{self._name or 'the array'} is encoded by {', '.join(foreign)}, which may run code; write "
+                "it again with blosc, gzip or zstd"
             )
-        self.set_stack(path, array.shape, np.dtype(array.dtype), settings, f"array {self._name}".strip())
+        self.set_stack(array.shape, np.dtype(array.dtype), settings, f"array {self._name}".strip())
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         piece = getattr(array, "shards", None) or array.chunks
-        check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
-        self.take_facts(facts_from_names(attributes))
-        self.notes = _channel_notes(path, _axes(node), self._full)
-        missing = _check_chunks(path, path / self._name, array, parts)
+        check_coded(self.shape, piece, self.dtype.itemsize, file_size(path))
+        self.take_facts(*facts_from_names(attributes))
+        self.notes = (*channel_notes(_channels(node, self._full), self.shape[0]),)
+        missing = _check_chunks(path / self._name, array, parts)
         self.notes += missing
         self.unwritten = bool(missing)
 
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import zarr
 
-        if not self.paths[0].exists():  # missing chunks would read as the fill value
-            raise changed(self.paths[0], "the store disappeared")
         node: Any = zarr.open(self.paths[0], mode="r")
         array = node[self._name] if self._name else node
         for part, window in windows(buffer, self._full, t0, y0):
             part[...] = np.asarray(array[window])
 
 
-def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
+def _check_chunks(folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
     """Refuse chunks that hold more than their shape; say how many are missing, and read as the fill value.
 
     The time of the library's ``nchunks_initialized`` would grow as the square of their number.
@@ -112,20 +109,20 @@ def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -
     shards, size = getattr(array, "shards", None), math.prod(array.chunks)
     files = [p for p in parts if folder in p.parents and p.is_file() and p.name not in _DESCRIBED]
     if shards is not None and math.prod(shards) > _MOST_IN_A_SHARD * size:
-        raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
+        raise InputError(f"shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
     places = chosen_pieces(((part, 0, part.stat().st_size) for part in files), itemgetter(2))
     codecs = codec_names(array)
     if shards is not None:
         sharding = array.metadata.codecs[-1]
         if codecs.count("sharding_indexed") > 1 or not hasattr(sharding, "index_location"):
-            raise InputError(f"{path}: shards within shards, or compressed as a whole; write single shards")
+            raise InputError("shards within shards, or compressed as a whole; write single shards")
         chunks = (
             place for part, _, _ in places for place in _places(part, sharding, math.prod(shards) // size)
         )
         places = chosen_pieces(chunks, itemgetter(2))
-    check_unpacked_size(path, itertools.starmap(_read, places), 4 * size * array.dtype.itemsize, codecs)
+    check_unpacked_size(itertools.starmap(_read, places), 4 * size * array.dtype.itemsize, codecs)
     wanted = n_pieces(array.shape, shards or array.chunks)
-    return unwritten_notes(path, wanted - len(files), wanted)
+    return unwritten_notes(wanted - len(files), wanted)
 
 
 def _places(part: Path, sharding: Any, chunks: int) -> Iterator[tuple[Path, int, int]]:
@@ -154,22 +151,12 @@ def _scales(group: Any) -> Any:
     return record.get("multiscales") if hasattr(record, "get") else None
 
 
-def _axes(node: Any) -> list[str]:
-    """Return the names of the axes of an OME-Zarr image (of versions before 0.3 always the same)."""
+def _channels(node: Any, shape: Sequence[int]) -> int:
+    """Return the length of the axis of channels of an OME-Zarr image of some shape; 1 where it has none."""
     scales = _scales(node)
-    axes = scales[0].get("axes", "tczyx") if scales else []
-    return [str(axis.get("name", "") if hasattr(axis, "get") else axis) for axis in axes]
-
-
-def _channel_notes(path: Path, axes: Sequence[str], shape: Sequence[int]) -> tuple[str, ...]:
-    """Say that channels are read as frames; refuse those that have another axis, too."""
-    if "c" not in axes or len(axes) != len(shape) or (channels := shape[axes.index("c")]) < 2:
-        return ()
-    if channels < math.prod(shape[:-2]):
-        raise InputError(
-            f"{path}: its metadata describe {channels} channels beside frames; write one array per channel"
-        )
-    return (f"{path.name}: its metadata describe the images as {channels} channels; read as frames",)
+    axes = scales[0].get("axes", "tczyx") if scales else []  # of versions before 0.3 always the same
+    names = [axis.get("name", "") if hasattr(axis, "get") else axis for axis in axes]
+    return shape[names.index("c")] if "c" in names and len(names) == len(shape) else 1
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:

@@ -23,6 +23,7 @@ from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import target as run_target
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner import session
@@ -217,6 +218,35 @@ def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path
         parse_config("simulate: {output: 's3://lab/frames'}")
 
 
+@pytest.mark.parametrize(
+    ("home", "name", "arguments"),
+    [
+        ("compare.compare", "compare_runs", ("compare", "a.zarr", "b.zarr")),
+        ("demo", "run_demo", ("demo",)),
+        ("export", "export_run", ("export", "run.zarr")),
+        ("figures", "figures_of_run", ("figures", "run.zarr")),
+        ("apply.apply", "apply_to_frames", ("apply", "run.zarr", "a.tif")),
+    ],
+)
+def test_commands_of_a_run_are_quiet_if_asked_and_know_where_to_write(
+    calls, home, name, arguments, monkeypatch
+):
+    called = Mock(return_value="")
+    monkeypatch.setattr(f"pchem_pipeline.commands.{home}.{name}", called)
+    assert invoke(*arguments, "--quiet").exit_code == 0
+    given = called.call_args.args
+    assert any(getattr(each, "quiet", getattr(each, "_quiet", False)) for each in given)
+    assert any(
+        path in given for path in map(Path, ("compare", "pchem-demo", "export", "figures", "calibrated.zarr"))
+    )
+
+
+def test_frames_without_their_run_are_told_what_is_needed(tmp_path):
+    (tmp_path / "1.fits").touch()
+    with pytest.raises(ConfigError, match=r"1.fits is no run; .*: pchem apply run.zarr FRAMES"):
+        invoke("apply", tmp_path / "1.fits", tmp_path / "2.fits")
+
+
 def test_what_cannot_be_drawn_is_refused_before_anything_is_read():
     for wanted, words in (
         ({"formats": ("pdf", "jpg")}, "--format: jpg cannot be drawn; choose from pdf, svg, png"),
@@ -224,7 +254,7 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_read():
         ({"width": "88 px"}, "--width '88 px': write a length such as 88mm"),
     ):
         with pytest.raises(ConfigError, match=words):
-            figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
+            figures_of_run(Path("nowhere.zarr"), Path("out"), Reporter("off"), **wanted)
 
 
 @pytest.mark.parametrize("option", ["--only", "--format"])
@@ -232,4 +262,4 @@ def test_a_list_of_nothing_does_not_mean_all_and_a_folder_without_a_run_is_told(
     with pytest.raises(ConfigError, match=f"{option}: ' ,' is no name"):
         invoke("figures", "run.zarr", option, " ,")
     with pytest.raises(StoreError, match="there is no run at"):
-        figures_of_run(tmp_path, tmp_path / "out")
+        figures_of_run(tmp_path, tmp_path / "out", Reporter("off"))

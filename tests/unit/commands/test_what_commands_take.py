@@ -14,6 +14,7 @@ from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.maps.defects import Defect
 from pchem_pipeline.report.comparison import DefectChange, by_change
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
@@ -84,7 +85,7 @@ def test_a_pixel_has_a_new_defect_unless_what_it_is_seen_in_agrees_within_the_er
 def test_what_cannot_be_hidden_and_a_folder_of_something_else_are_refused(tmp_path, folder, asked, said):
     (tmp_path / "mine.txt").touch()
     with pytest.raises(ConfigError, match=said):
-        run_demo(tmp_path / folder, hidden=asked, size=8, n_frames=60, seed=1)
+        run_demo(tmp_path / folder, Command(), hidden=asked, size=8, n_frames=60, seed=1)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 

@@ -260,7 +260,7 @@ def test_identity(tmp_path):
     assert quick_identity(there.paths) != before
     assert [file["size"] for file in before["files"]] == [file["size"] for file in identity["files"]]
     (second / "a_00003.npy").unlink()
-    with pytest.raises(InputError, match="check that it is still there"):
+    with pytest.raises(InputError, match="cannot be read"):
         quick_identity(there.paths)
 
 

@@ -182,7 +182,7 @@ def test_channels_beside_frames_are_refused(tmp_path):
     tifffile.imwrite(imagej, mixed, imagej=True, metadata={"axes": "TCYX"})
     tifffile.imwrite(ome, mixed, metadata={"axes": "TCYX"}, photometric="minisblack")
     for path in (imagej, ome):
-        refused("the 6 pages as 2 channels of 3 images", path)
+        refused("the 6 images as 2 channels of 3;", path)
     tifffile.imwrite(imagej, STACK, imagej=True, metadata={"axes": "CYX"})
     reader = TiffReader.open(imagej, InputSettings())
     np.testing.assert_array_equal(reader.read(), STACK)

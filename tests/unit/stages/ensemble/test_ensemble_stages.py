@@ -32,6 +32,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
@@ -383,7 +384,9 @@ def test_ready_made_histograms(tmp_path, n_samples):
 
 def test_export(finished, tmp_path):
     finished.store.write_config(dump_config(finished.config))
-    written = export_run(finished.store.path, tmp_path / "out", ("fits", "tiff", "npz", "csv", "emva"))
+    written = export_run(
+        finished.store.path, tmp_path / "out", ("fits", "tiff", "npz", "csv", "emva"), Reporter("off")
+    )
     assert all(path.exists() for path in written)
     gain = finished.store.read("maps/conversion_gain")
     with fits.open(tmp_path / "out" / "maps.fits") as file:
@@ -405,7 +408,7 @@ def test_export(finished, tmp_path):
 
 def test_export_for_other_programs(finished, tmp_path):
     finished.store.write_config(dump_config(finished.config))
-    written = export_run(finished.store.path, tmp_path, tuple(ADAPTERS))
+    written = export_run(finished.store.path, tmp_path, tuple(ADAPTERS), Reporter("off"))
     assert all(path.exists() for path in written)
     names = ("bias", "conversion_gain", "read_noise_e", "quanta_exposure")
     bias, gain, noise, exposure = (finished.store.read(f"maps/{name}") for name in names)
@@ -512,11 +515,11 @@ def test_export_says_what_is_wrong(finished, tmp_path):
     run = finished.store.path
     finished.store.write_config(dump_config(finished.config))
     with pytest.raises(ConfigError, match="xlsx cannot be written; choose from fits, tiff, npz, csv"):
-        export_run(run, tmp_path, ("fits", "xlsx"))
+        export_run(run, tmp_path, ("fits", "xlsx"), Reporter("off"))
     empty = RunStore.create(tmp_path / "empty.zarr")
     empty.write_config(dump_config(finished.config))
     with pytest.raises(StoreError, match="no maps yet"):
-        export_run(empty.path, tmp_path, ("csv",))
+        export_run(empty.path, tmp_path, ("csv",), Reporter("off"))
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StoreError, match="cannot use"):
-        export_run(run, tmp_path / "file", ("csv",))
+        export_run(run, tmp_path / "file", ("csv",), Reporter("off"))
