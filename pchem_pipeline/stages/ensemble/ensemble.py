@@ -63,7 +63,6 @@ class _Job:
     Attributes:
         tiles: number and place of each tile by its key.
         frames: the chosen frames (first, end), or None where there are none to choose from.
-        codes: by tile the samples of all frames, where the fit has counted them; see `code_sums`.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
         effects: with which the maps were fitted.
@@ -75,7 +74,6 @@ class _Job:
     axes: EnsembleAxes
     tiles: dict[str, tuple[int, Tile]]
     frames: tuple[int, int] | None
-    codes: dict[str, dict[str, Any]]
     source: FrameSource | None
     truth: tuple[int, int, int] | None
     effects: tuple[Effect, ...]
@@ -149,8 +147,7 @@ def run(context: StageContext) -> None:
         return
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
-    codes = {} if frames is None or everything else _codes(context)
-    job = _Job(context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits)
+    job = _Job(context.config, sensor, axes, numbered, frames, source, truth, effects, limits)
     rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -168,13 +165,6 @@ def run(context: StageContext) -> None:
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
         totals = _totals(store, job, [numbered[tile.key][0] for tile in finished])
         _write_result(store, totals, fitted, job, made)
-
-
-def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
-    """Return the samples of each code that the fit counted, by tile."""
-    record = context.store.records.read("fit")
-    made = {} if record is None else context.store.records.summaries("fit", record.fingerprint)
-    return {key: summary["codes"] for key, summary in made.items() if "codes" in summary}
 
 
 def _chosen_frames(sensor: SensorInfo, settings: EnsembleSettings) -> tuple[int, int] | None:
@@ -249,12 +239,7 @@ def _sum_tile(
     fit, histogram = (store.at(tile.region, group) for group in ("fit", "histogram"))
     maps = [fit[name] for name in PARAMETERS]
     origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
-    codes = None if chosen is None else job.codes.get(tile.key)
-    if codes is None:
-        counted = PixelHistograms(histogram["counts"], origin, histogram["under"] + histogram["over"])
-    else:  # only the number of the samples matters
-        outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
-        counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
+    counted = PixelHistograms(histogram["counts"], origin, histogram["under"] + histogram["over"])
     errors = _errors(fit, tile, job.sensor.shape)
     numbers = np.arange(origin.size).reshape(origin.shape)  # of the pixels, in C order
     rows = []
@@ -273,22 +258,7 @@ def _sum_tile(
         )
         rows.append(row)
     integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
-    if codes is not None:
-        samples, beyond = on_axis(codes, job.axes.dn)
-        integers[job.axes.integers["counts_all"]] = samples
-        integers[job.axes.integers["outside_all"]] = beyond
-        floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
-
-
-def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[IntArray, int]:
-    """Return the samples at each DN of an axis, and those beyond it; see `code_sums`."""
-    place = np.array(content["dn"], np.int64) - axis.start
-    samples = np.array(content["samples"], np.int64)
-    inside = (place >= 0) & (place < axis.size)
-    found = np.zeros(axis.size, np.int64)
-    found[place[inside]] = samples[inside]
-    return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
 def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | None:

@@ -21,7 +21,6 @@ from pchem_pipeline.model.errors.expected_information import (
     biased_by_rounding,
 )
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, moves_gain
-from pchem_pipeline.model.law.parameters import usable_pixels
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
@@ -105,7 +104,7 @@ def _create(context: StageContext, how: TileFit, dtype: np.dtype[Any]) -> None:
 def _do_tile(
     tile: Tile, store: RunStore, *, samples: Sequence[Path], how: TileFit, model: ModelVersion
 ) -> dict[str, Any]:
-    """Fit one tile of the store; the summary counts its pixels, and the samples of each code.
+    """Fit one tile of the store; the summary counts its pixels.
 
     ``samples`` are the paths of the runs of several samples; empty for a run of one.
     """
@@ -144,7 +143,6 @@ def _do_tile(
     if samples:
         return {**summary, "poor": int(np.count_nonzero(words & np.uint16(int(FitStatus.POOR_FIT))))}
     maps = [arrays[f"fit/{name}"] for name in PARAMETERS]
-    summary["codes"] = code_sums(histograms[0], maps)
     if how.settings.likelihood == "density" and not how.effects:
         frames = histograms[0]["counts"].sum(axis=2, dtype=np.float64)
         biased = biased_by_rounding([values.ravel() for values in maps], frames.ravel())
@@ -158,28 +156,6 @@ def _leave_out(arrays: Arrays, excluded: BoolArray) -> None:
         if values.dtype.kind == "f":
             values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
     arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
-
-
-def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]:
-    """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
-
-    These are the codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
-    The ensemble compares all frames with the model, and would decode every histogram again for it. Histogram
-    as of `fit_tile`; maps are (H, g, mu, sigma), (y, x) each, NaN without a value.
-    """
-    usable, counts, origin = usable_pixels(*maps), histogram["counts"], histogram["origin"]
-    start = int(origin.min())
-    samples = np.zeros(int(origin.max()) - start + counts.shape[2], np.int64)
-    for first in np.unique(origin[usable]):  # few: windows begin at round numbers
-        place = int(first) - start
-        some = counts[usable & (origin == first)].sum(axis=0, dtype=np.int64)
-        samples[place : place + some.size] += some
-    occupied = np.flatnonzero(samples)
-    return {
-        "dn": (start + occupied).tolist(),
-        "samples": samples[occupied].tolist(),
-        "outside": sum(int(histogram[name][usable].sum(dtype=np.int64)) for name in ("under", "over")),
-    }
 
 
 # -- what all pixels of the sensor together say about the fit of each ------------------------------
