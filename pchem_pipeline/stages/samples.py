@@ -49,23 +49,24 @@ class OpenSample:
         return [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
 
 
-def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
-    """Return the runs of the samples.
+def find_runs(names: Sequence[Path | str], base_dir: Path, setting: str, *first: Target) -> list[Target]:
+    """Return the ``first`` runs and those of a setting, below a folder.
 
     Raises:
-        ConfigError: two samples are one run, or a run cannot be found.
+        ConfigError: two are one run, or a run cannot be found.
     """
-    targets, seen = [], dict[str, str]()
-    for sample in config.input.samples:
-        target = find_run(base_dir / sample.run)
-        place = str(target.store.resolve())
-        if place in seen:
-            raise ConfigError(
-                f"input.samples: {sample.run} is the run of {seen[place]} again; list each run once"
-            )
-        seen[place] = str(sample.run)
+    targets = list(first)
+    for name in names:
+        target = find_run(base_dir / name)
+        if target.store.resolve() in [each.store.resolve() for each in targets]:
+            raise ConfigError(f"{setting}: {name} is the run of {target.store.name} again; list each run once")
         targets.append(target)
     return targets
+
+
+def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
+    """Return the runs of the samples; see `find_runs`."""
+    return find_runs([sample.run for sample in config.input.samples], base_dir, "input.samples")
 
 
 def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
@@ -75,17 +76,23 @@ def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
         ConfigError: two samples are one run, or a run cannot be found.
         StoreError: a run has no histograms.
     """
-    found = []
-    for given, target in zip(config.input.samples, sample_targets(config, base_dir), strict=True):
-        store = RunStore.open(target.store)
-        record = store.records.read("histogram")
-        where = f"sample {given.run}"
-        if record is None or not store.has("histogram/counts"):
-            raise StoreError(
-                f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
-            )
-        found.append(OpenSample(where, target, store, target.sensor(store), record.fingerprint))
-    return found
+    samples = zip(config.input.samples, sample_targets(config, base_dir), strict=True)
+    return [open_sample(target, f"sample {given.run}") for given, target in samples]
+
+
+def open_sample(target: Target, where: str) -> OpenSample:
+    """Return a run with its histograms.
+
+    Raises:
+        StoreError: it has none.
+    """
+    store = RunStore.open(target.store)
+    record = store.records.read("histogram")
+    if record is None or not store.has("histogram/counts"):
+        raise StoreError(
+            f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
+        )
+    return OpenSample(where, target, store, target.sensor(store), record.fingerprint)
 
 
 def check_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
@@ -97,10 +104,19 @@ def check_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
         StoreError: a run has no histograms.
     """
     samples = open_samples(config, base_dir)
-    for i in range(1, len(samples)):
-        _same_sensor(samples[:i], samples[i])
+    same_sensor(samples)
     _check_increasing(config.input, samples)
     return samples
+
+
+def same_sensor(samples: Sequence[OpenSample]) -> None:
+    """Check that samples have different frames of the same pixels.
+
+    Raises:
+        ConfigError: they have not.
+    """
+    for i in range(1, len(samples)):
+        _same_sensor(samples[:i], samples[i])
 
 
 def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
