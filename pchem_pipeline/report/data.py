@@ -293,12 +293,11 @@ class ReportData:
 
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
         """Describe a map, once, by order statistics of all pixels with a value or of unflagged ones."""
-        if (name, with_flagged) not in self._summaries:
-            self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
-            if self.flagged.any():
-                known = Ordered.of(self.maps[name], self.flagged_in(name))
-                self._summaries[name, False] = self._summarised(known)
-        return self._summaries[name, with_flagged]
+        key = name, with_flagged or not bool(self.flagged.any())
+        if key not in self._summaries:
+            known = self.ordered(name) if key[1] else Ordered.of(self.maps[name], self.flagged_in(name))
+            self._summaries[key] = self._summarised(known)
+        return self._summaries[key]
 
     @property
     def overscan_medians(self) -> dict[str, Any]:
@@ -319,6 +318,11 @@ class ReportData:
 
     def _summarised(self, known: Ordered) -> MapSummary:
         return summarise(known, outlier_sigmas=self.outlier_sigmas)
+
+    def estimate(self, name: str, y: int, x: int) -> tuple[float, float]:
+        """Return the value of a pixel in a map with its standard error; NaN if unknown."""
+        errors = self.maps.get(f"{name}_stderr")
+        return float(self.maps[name][y, x]), np.nan if errors is None else float(errors[y, x])
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
         """Return the median standard error of a pixel, of all or of those without a flag; None if unknown."""

@@ -316,7 +316,6 @@ def json_for_html(content: Any) -> Markup:
 
 
 def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
-    """Return what the script must know beside the maps."""
     sample = shown.sample
     return {
         "shape": list(data.shape),

@@ -175,7 +175,6 @@ def copy_units(
 
 
 def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None:
-    """Read the frames of a unit and write them into the store, a row of chunks at a time."""
     rows, (t0, t1, y0, y1) = store.array("frames/dn").chunks[1], unit.content
     for y in range(y0, y1, rows):
         end = min(y + rows, y1)

@@ -113,7 +113,6 @@ def _arrays(
     line: _Line | None,
     n_frames: int | None,
 ) -> dict[str, NDArray[Any]]:
-    """Return all that the stage makes of the fit of some pixels, by path."""
     maps = maps_tile(store.at(region, "fit"), integration_time, rate, n_frames)
     found = {f"maps/{name}": values for name, values in maps.items()}
     return found if line is None else found | _line_arrays(store.at(region, "samples"), line)
@@ -124,7 +123,6 @@ def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDA
 
 
 def _line_arrays(samples: Arrays, line: _Line) -> dict[str, NDArray[Any]]:
-    """Return the results of a line through the exposures of each pixel, by path."""
     exposure, covariance, (names, x) = samples["quanta_exposure"], samples["covariance"], line
     n, *shape = exposure.shape
     maps, left = line_maps(exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), x, names)
@@ -136,7 +134,6 @@ def _line_arrays(samples: Arrays, line: _Line) -> dict[str, NDArray[Any]]:
 
 
 def _summarise(context: StageContext, names: list[str]) -> None:
-    """Keep the summaries of the maps in the attributes of their group."""
     settings = context.config.maps
     status = context.store.read("fit/fit_status")
     found: dict[str, Any] = {}

@@ -153,7 +153,6 @@ def _do(
 
 
 def _sample(store: RunStore, y: IntArray, x: IntArray) -> Sample:
-    """Read the histograms of some pixels."""
     counts, origin = (store.read_pixels(f"histogram/{name}", y, x) for name in ("counts", "origin"))
     return Sample(counts, origin.astype(np.int64))
 
@@ -173,7 +172,6 @@ def _reference(store: RunStore, y: IntArray, x: IntArray) -> tuple[FloatArray, s
 def _sample_words(
     names: Sequence[str], samples: Sequence[Sample], reference: FloatArray
 ) -> list[dict[str, Any]]:
-    """Describe the samples: name, frames, and the median exposure that the reference gives them."""
     found = []
     for name, sample in zip(names, samples, strict=True):
         moments = sample.moments()
@@ -190,7 +188,6 @@ def _sample_words(
 
 
 def _remarks(samples: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say what the comparison lacks."""
     if len(samples) == 1:
         return [
             "one sample: methods that need dark frames or a series are omitted; add runs of the same pixels "

@@ -56,10 +56,11 @@ def find_runs(names: Sequence[Path | str], base_dir: Path, setting: str, *first:
         ConfigError: two are one run, or a run cannot be found.
     """
     targets = list(first)
-    for name in names:
-        target = find_run(base_dir / name)
+    for target, name in ((find_run(base_dir / name), name) for name in names):
         if target.store.resolve() in [each.store.resolve() for each in targets]:
-            raise ConfigError(f"{setting}: {name} is the run of {target.store.name} again; list each run once")
+            raise ConfigError(
+                f"{setting}: {name} is the run of {target.store.name} again; list each run once"
+            )
         targets.append(target)
     return targets
 
@@ -199,7 +200,6 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
 
 
 def _exposures(settings: InputSettings, samples: Sequence[OpenSample]) -> tuple[Sample, ...]:
-    """Return what is known of the exposure of each sample."""
     return tuple(
         Sample(
             found.store.path.name,

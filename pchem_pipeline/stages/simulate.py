@@ -208,7 +208,6 @@ def _electron_units(settings: SimulateSettings) -> list[_Unit]:
 
 
 def _prepare(folder: Path, settings: SimulateSettings) -> None:
-    """Remove the files of an earlier simulation, and nothing else; refuse a disk that is too small."""
     needed = settings.n_frames * math.prod(settings.shape) * dn_dtype(settings.bit_depth).itemsize
     with in_storage(folder):
         if folder.exists() and any(folder.iterdir()):

@@ -119,7 +119,6 @@ class Drawing(MatplotlibFigure):
             super().savefig(*args, **kwargs)
 
     def _repr_png_(self) -> bytes:
-        """Return the figure as a notebook shows it."""
         return drawing_bytes(self, "png", dpi=150)
 
 
@@ -356,7 +355,6 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, width_mm: fl
 
 
 def _note(axes: Axes, text: str, corner: str) -> None:
-    """Write a small note into a corner of the axes."""
     vertical, horizontal = corner.split()
     x, va = 0.985 if horizontal == "right" else 0.015, "top" if vertical == "upper" else "bottom"
     y = 0.975 if vertical == "upper" else 0.03

@@ -182,7 +182,6 @@ def _one_half(table: DataTable, unit: str, title: str) -> Stack:
 
 
 def _curve(run: RunFacts, axis: str, prefix: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the axis, the density and its standard error by counting."""
     x, density, counts = (
         np.asarray(run.ensemble[each], dtype=np.float64)
         for each in (axis, f"{prefix}density", f"{prefix}counts")
@@ -258,7 +257,6 @@ def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
 def _history_chart(
     table: DataTable, names: tuple[str, ...], axis: str, ticks: tuple[tuple[float, str], ...] = ()
 ) -> Chart:
-    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels."""
     order = np.argsort(table[axis], kind="stable")
     at = table[axis].astype(np.float64)[order]
     panels = []

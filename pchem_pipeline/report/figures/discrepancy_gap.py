@@ -95,7 +95,6 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
 
 
 def _gap_tables(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tuple[DataTable, ...]:
-    """Return the gap of each model, with its interval and the floor, and by family of statistics."""
     names, unit = ("model", *GapBar._fields[1:]), "1e-6 nats/sample"
     columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
     columns["floor"] = [floor] * len(bars)
@@ -198,7 +197,6 @@ def _limits(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tu
 
 
 def _gap_axis(ends: tuple[float, float]) -> tuple[Axis, list[Mark]]:
-    """Return the axis of gaps, and a line at each power of ten."""
     powers = range(math.ceil(math.log10(ends[0])) + 1, math.ceil(math.log10(ends[1])))
     grid: list[Mark] = [Level(10.0**power, "x", colour="grid", width=0.5) for power in powers]
     return Axis("gap (micronats per sample)", *ends, log=True), grid
@@ -247,7 +245,6 @@ def _point(value: float, row: int, left: float, role: str, label: str = "") -> P
 
 
 def _pulls_chart(rows: Sequence[Pull]) -> Chart:
-    """Return the largest pulls before and after, in sigma."""
     marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
     places = np.arange(len(rows))
     values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}

@@ -141,7 +141,6 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
 
 
 def _line_tables(line: str, rms: NDArray[Any], image: NDArray[Any], first: int) -> list[DataTable]:
-    """Return the scatter of each row or column, and their means in the first frames."""
     axis = "y" if line == "row" else "x"
     columns = {axis: first + np.arange(rms.shape[1])}
     columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
@@ -230,7 +229,6 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None) -> Pixel
 def _sensor_chart(
     maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
 ) -> Chart:
-    """Return maps of statistics of each pixel, and below their histograms with that under the model."""
     shown, below = [], []
     for each in maps:
         inside = _inside(each, origin)
@@ -273,7 +271,6 @@ def _inside(each: PixelMap, origin: tuple[int, int]) -> BoolArray | None:
 
 
 def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
-    """Return the edges of a set of pixels."""
     padded = np.pad(inside, 1)
     y, x = origin
     # each edge of a pixel that parts inside from outside is a line of its own, between gaps
@@ -289,7 +286,6 @@ def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
 
 
 def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> Stack:
-    """Return the means of the rows or columns of the first frames as a picture."""
     title, axis = f"{channel}: means of {LINE_WORDS[line]}", "y (pixel)" if line == "row" else "x (pixel)"
     x = Axis("frame (the first ones examined)", whole=True)
     panel = Panel(Axis(axis, whole=True), (), note="not kept")
@@ -420,7 +416,6 @@ _NAMED = "expected with added effects"
 
 
 def _frame_tables(arrays: Arrays) -> tuple[DataTable, DataTable]:
-    """Return means of the frames in both channels and their noise, and means over stretches of the run."""
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     columns, means = {"frame": number}, dict[str, FloatArray]()
     units: dict[str, str] = {}
@@ -441,7 +436,6 @@ def _model(channel: str) -> str:
 
 
 def _codes_chart(table: DataTable, marked: Sequence[Place]) -> Chart:
-    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour."""
     dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
     shaded = [
@@ -507,7 +501,6 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
 def _frames_chart(
     frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place]
 ) -> Chart:
-    """Return the chart of the frames in both channels and of their noise, with the path of named effects."""
     panels = []
     for channel, sd in sds.items():
         shaded = [

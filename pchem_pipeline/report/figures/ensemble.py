@@ -188,8 +188,6 @@ def ensemble_chart(
 
 
 class _Drawn:
-    """One half of the figure: data and predictions on one axis."""
-
     def __init__(self, table: DataTable, rmse: Mapping[str, float], n_frames: int | None) -> None:
         _, axis, data, model, unit, words, self.title = next(h for h in HALVES if h.part == table.part)
         self.unit = unit_text(unit)

@@ -180,7 +180,6 @@ def map_chart(tables: Sequence[DataTable], name: str, known: Ordered) -> Chart:
 
 
 def _histogram_stack(known: Ordered, bins: DataTable, label: str, height_mm: float = 34.0) -> Stack:
-    """Return the histogram of a map with its median."""
     shown = robust_range(known)
     left, right, counts = (bins[name] for name in bins.columns)
     x = Axis(label, shown.low, shown.high, log=shown.logarithmic)
@@ -269,7 +268,6 @@ def _share(part: int, whole: int) -> str:
 
 
 def _goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
-    """Return the p-values of all pixels against a uniform distribution, and a map of the goodness of fit."""
     bins = 20
     deviate, known = table["misfit"], finite(table["p"])
     counts, edges = np.histogram(known, bins, (0.0, 1.0))

@@ -85,7 +85,6 @@ def method_figures(data: ReportData) -> Iterator[Figure]:
 
 
 def _method_tables(study: _Rows, known: _Rows) -> tuple[DataTable, ...]:
-    """Return the errors on simulated pixels, where there are any, and on the pixels of the run."""
     tables = []
     if study:
         columns: dict[str, Any] = {"read_noise_e": [point["read_noise_e"] for point in study]}

@@ -81,7 +81,6 @@ def pixel_figures(data: ReportData) -> Iterator[Figure]:
 
 
 def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
-    """Return the histograms of pixels with what their fits expect, and their parameters."""
     parts = [pixel_columns(pixel) for pixel in pixels]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     units = {"y": "pixel", "x": "pixel", "dn": "DN", "residual": "standard deviations"}

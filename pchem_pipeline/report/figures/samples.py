@@ -75,7 +75,6 @@ def transfer_figures(data: ReportData) -> Iterator[Figure]:
 
 
 def _exposure_table(samples: Samples) -> DataTable:
-    """Return medians over the pixels of H and of its residuals, of the samples on the line."""
     words, unit, *_ = AXES[samples.against]
     chosen = samples.on_line
     exposures = np.array([middle(samples.arrays["quanta_exposure"][i]) for i in chosen])

@@ -209,7 +209,6 @@ def _nonzero_counts(numbers: Mapping[str, str]) -> str:
 
 
 def _defect_words(row: HistoryRow) -> str:
-    """Return the number of defects by kind, and where they differ from those of the first run."""
     parts = [_nonzero_counts({kind: row[f"{kind}_pixels"] for kind in map(words_of, FAULTS)}) or "none"]
     for change in by_change(()):
         if places := row[f"defects_{change.replace(' ', '_')}"].split():

@@ -23,7 +23,7 @@ from pchem_pipeline.base.wording import (
     signed,
     unit_text,
 )
-from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData, Samples, truth_errors
@@ -75,7 +75,11 @@ def _quick_look(data: ReportData) -> Table:
                 "check": capitalised(check.title),
                 "found": ("in the model" if check.in_model else "yes") if check.found else "no",
                 "size": size_text(check) if check.found else "",
-                "detection limit": _limit_text(check),
+                "detection limit": size_text(
+                    replace(check, size=check.limit, size_e=math.nan, share=math.nan)
+                )
+                if math.isfinite(check.limit)
+                else "not known",
                 "p-value": _chance_text(check.p_global),
                 "where": check.where if check.found else "",
             }
@@ -83,12 +87,6 @@ def _quick_look(data: ReportData) -> Table:
         ],
         "discrepancy",
     )
-
-
-def _limit_text(check: Check) -> str:
-    if not math.isfinite(check.limit):
-        return "not known"
-    return size_text(replace(check, size=check.limit, size_e=math.nan, share=math.nan))
 
 
 def _chance_text(p: float) -> str:
@@ -184,20 +182,14 @@ def _flagged(data: ReportData) -> Table:
 def _channels(data: ReportData) -> Table | None:
     if data.shape[0] > 1 or data.shape[1] > 100:
         return None  # the maps of the store have them all
-    rows = [_channel_row(data, x) for x in range(data.shape[1])]
+    labels = [*data.channel_names, *[""] * data.shape[1]]
+    rows = [
+        {"channel": f"{x} {label}".strip()}
+        | {heading(name): measured(*data.estimate(name, 0, x)) for name in _known(data)}
+        | {"fit status": describe(int(data.status[0, x]))}
+        for x, label in enumerate(labels[: data.shape[1]])
+    ]
     return Table("channels", "Channels", "Estimates with their standard errors.", rows)
-
-
-def _channel_row(data: ReportData, x: int) -> Row:
-    label = data.channel_names[x] if x < len(data.channel_names) else ""
-    missing = np.full(data.shape, np.nan)
-    values = {
-        heading(name): measured(
-            float(data.maps[name][0, x]), float(data.maps.get(f"{name}_stderr", missing)[0, x])
-        )
-        for name in _known(data)
-    }
-    return {"channel": f"{x} {label}".strip(), **values, "fit status": describe(int(data.status[0, x]))}
 
 
 def _against_truth(data: ReportData) -> Table:
@@ -206,21 +198,19 @@ def _against_truth(data: ReportData) -> Table:
         "Estimates against the truth",
         "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 if estimates are unbiased, "
         f"scatter (standard deviation) 1 if errors are correct.{_left_out(data)}",
-        list(_truth_rows(data)),
+        [
+            {
+                "parameter": heading(name),
+                "true median": short(found.true_median, 4),
+                "estimated median": short(found.median, 4),
+                "RMSE": short(found.rmse),
+                "mean pull": measured(float(pull.mean()), n**-0.5) if n else "not known",
+                "scatter of pulls": measured(float(pull.std()), (2 * n) ** -0.5) if n else "not known",
+            }
+            for name, found in truth_errors(data).items()
+            for pull, n in [(found.pulls, found.pulls.size)]
+        ],
     )
-
-
-def _truth_rows(data: ReportData) -> Iterator[Row]:
-    for name, found in truth_errors(data).items():
-        pull, n = found.pulls, found.pulls.size
-        yield {
-            "parameter": heading(name),
-            "true median": short(found.true_median, 4),
-            "estimated median": short(found.median, 4),
-            "RMSE": short(found.rmse),
-            "mean pull": measured(float(pull.mean()), float(1 / np.sqrt(n))) if n else "not known",
-            "scatter of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
-        }
 
 
 #: RMSE of each prediction of the ensemble, and of the sampling noise beside them, to words and unit.
@@ -420,22 +410,23 @@ def _run(data: ReportData) -> Table:
 
 def _stages(data: ReportData) -> Table:
     words = "Wall time, CPU time and largest resident memory of a process."
-    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], "provenance")
 
+    def text(stage: Mapping[str, Any], key: str, words: str = "{}", unit: float | None = None) -> str:
+        value = stage.get(key)
+        return "" if value is None else words.format(value if unit is None else float(value) / unit)
 
-def _stage_row(stage: Mapping[str, Any]) -> Row:
-    def seconds(key: str) -> str:
-        return f"{float(stage[key]):.1f} s" if stage.get(key) is not None else ""
-
-    memory = stage.get("peak_memory_bytes")
-    return {
-        "stage": str(stage.get("stage", "")),
-        "state": str(stage.get("state", "")),
-        "wall": seconds("seconds"),
-        "CPU": seconds("cpu_seconds"),
-        "peak memory": f"{float(memory) / 2**20:.0f} MiB" if memory else "",
-        "started (UTC)": str(stage.get("started", "")),
-    }
+    rows = [
+        {
+            "stage": text(stage, "stage"),
+            "state": text(stage, "state"),
+            "wall": text(stage, "seconds", "{:.1f} s", 1.0),
+            "CPU": text(stage, "cpu_seconds", "{:.1f} s", 1.0),
+            "peak memory": text(stage, "peak_memory_bytes", "{:.0f} MiB", 2**20),
+            "started (UTC)": text(stage, "started"),
+        }
+        for stage in data.stages
+    ]
+    return Table("stages", "Stages", words, rows, "provenance")
 
 
 #: Files that are listed at most.

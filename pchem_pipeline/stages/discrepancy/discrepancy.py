@@ -210,7 +210,6 @@ class _Search:
             self.work += effort.spent
 
     def _taken(self, window: Window) -> dict[str, Any]:
-        """Return how the frames of a window were taken."""
         n_frames, *shape = self.source.shape
         known = tuple(place.region for place in self.seen.places.values())
         return {
@@ -222,7 +221,6 @@ class _Search:
 
 
 def _amounts(settings: DiscrepancySettings) -> dict[str, int]:
-    """Return the settings that the memory, or a clear disagreement, may lower."""
     names = ("max_samples", "max_pixels", "replicates", "extended_replicates")
     return {name: getattr(settings, name) for name in names}
 
@@ -266,7 +264,6 @@ def _samples(context: StageContext) -> list[SampleHistograms]:
 
 
 def _histograms(store: RunStore) -> SampleHistograms:
-    """Return the histograms of all pixels of a run."""
     if not store.has("histogram/counts"):
         place = quoted(store.path)
         raise StoreError(f"{_STAGE}: no histograms in the store; run: pchem histogram {place}")

@@ -185,7 +185,6 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
 
 
 def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
-    """Return the scores and the goodness of fit of each pixel, NaN without a law."""
     found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
     found["goodness"] = goodness_of(laws.moments["goodness"])
     return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}

@@ -228,7 +228,6 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
 
 
 def _in_band(tile: Tile, band: Band | Tile) -> tuple[slice, slice]:
-    """Return the index of a tile's pixels in its band."""
     return slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)
 
 
@@ -273,7 +272,6 @@ def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | No
 
 
 def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:
-    """Open the stream of the frames of a band."""
     assert job.source is not None
     return FrameStream(job.source, [(band.y0, band.y1)], FRAMES_AT_ONCE, frames=frames)
 
@@ -298,7 +296,6 @@ def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
 
 
 def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, tuple[IntArray, int]]:
-    """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
     assert job.frames is not None
@@ -325,7 +322,6 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, tuple[I
 
 
 def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
-    """Add the rows of the finished tiles; without frames every pixel counts the same."""
     samples = (1, 1)
     if job.frames is not None:
         gone, (first, end) = uncounted_frames(odd_frames_of(store)[0]), job.frames
@@ -395,7 +391,6 @@ def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels |
 
 
 def _missing(job: _Job, totals: EnsembleTotals) -> dict[str, str]:
-    """Say which parts of the ensemble this run does not have, and why."""
     missing: dict[str, str] = {}
     if job.frames is None:
         missing["frames"] = f"input is {job.sensor.kind}: the ensemble has all samples"

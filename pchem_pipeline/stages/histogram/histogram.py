@@ -81,7 +81,6 @@ def run(context: StageContext) -> None:
 
 
 def _end(context: StageContext) -> None:
-    """Do what needs the whole sensor."""
     if context.config.histogram.summaries:
         _write_frame_statistics(context)
     number = 0
@@ -95,7 +94,6 @@ def _end(context: StageContext) -> None:
 
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:
-    """Return the number of bins of the sensor, from its first frames."""
     settings, (n_frames, ny, columns) = context.config.histogram, source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
     most, together = max(ROW_GROUP, context.band_bytes // row), min(source.rows_per_read, ny)
@@ -116,7 +114,6 @@ def bins_of(source: FrameSource, frames: int, most: int, rows: int) -> int:
 
 
 def _do_band(band: Band, store: RunStore, *, job: CountJob, source: FrameSource, threads: int) -> None:
-    """Count a band and write its chunks."""
     rows = [(band.y0, band.y1)]
     with FrameStream(source, rows, job.settings.window_frames, threads=threads) as stream:
         StackCounter(job, rows).count(stream)

@@ -121,7 +121,6 @@ def _blocks_are_chunks(context: StageContext, frames: FrameSequence) -> bool:
 
 
 def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
-    """Return whether the memory allowed is enough."""
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
     return need <= allowed_bytes(context.config, context.config.compute.count())
 
@@ -147,7 +146,6 @@ def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStre
 
 
 def _create(context: StageContext, frames: FrameSequence, bins: int) -> None:
-    """Make the arrays of both stages anew."""
     context.fresh = True
     for name in (path for stage in PREPARED for path in STAGES[stage].writes):
         context.store.delete(name)

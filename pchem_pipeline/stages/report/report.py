@@ -75,7 +75,6 @@ def run(context: StageContext) -> None:
 def _write(
     unit: Unit, store: RunStore, *, config: RunConfig, stages: list[dict[str, Any]], draw: DrawAll
 ) -> dict[str, Any]:
-    """Gather, draw and write."""
     with beside(_workers(config.compute)) as hand:
         data = gather(store, config, stages, hand)
         files = render_report(data, draw)
@@ -144,7 +143,6 @@ def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> tuple[list[P
 
 
 def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
-    """Return the pixels that stand for the sensor."""
     data, names = run.data, run.sensor.names
     if asked:
         return [("", y, x) for y, x in asked]
@@ -154,7 +152,6 @@ def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
 
 
 def _inspector(run: StoredRun, sample: PixelSample, threads: int) -> InspectorData:
-    """Pack maps for the inspector, and add their values to the pixels that are held in full."""
     data = run.data
     read = {f"maps/{name}": values for name, values in data.maps.items()}
     read |= {f"fit/{name}": data.fit[name] for name in ("fit_status", "outlier_share") if name in data.fit}
@@ -163,7 +160,6 @@ def _inspector(run: StoredRun, sample: PixelSample, threads: int) -> InspectorDa
 
 
 def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
-    """Return what the table of stages shows, the report itself left out."""
     records, rows = context.store.records, []
     for record in (records.read(name) for name in pipeline() if name != context.stage):
         if record is not None:
@@ -182,7 +178,6 @@ def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
 
 
 def _workers(settings: ComputeSettings) -> int:
-    """Return how many may work on a report at a time."""
     workers = settings.count()
     if settings.max_memory is not None:
         workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))

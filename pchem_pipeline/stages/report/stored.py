@@ -219,7 +219,6 @@ def _input_text(sensor: SensorInfo) -> str:
 
 
 def _missing(name: str, sensor: SensorInfo, maps: Arrays, ensemble: Arrays, compared: bool) -> dict[str, str]:
-    """Say why parts are left out."""
     found: dict[str, str] = {}
     if not {*CHARGE_RATES, "charge_per_level"} & maps.keys():
         found["charge_rate"] = "no charge rate: input.against is none" if sensor.samples else NO_TIME
