@@ -49,9 +49,6 @@ LINE_MAPS = ("charge_per_level", "spurious_charge", "dark_signal")
 #: Order of the axis ``channel`` of the arrays of a verdict.
 CHANNELS = ("charge", "readout")
 
-#: Codes from which their distance is known.
-_FEWEST_CODES = 8
-
 
 def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, int]]:
     """Return each reason for caution or failure, gravest first: bit, sentence, pixels that have it."""
@@ -256,7 +253,8 @@ class ReportData:
         """Distance in DN at which codes occur in the whole sensor: 1, or 4 if left-justified by 2 bits."""
         dn, counts = (self.ensemble.get(name) for name in ("dn", "counts"))
         seen = np.empty(0) if dn is None or counts is None else dn[counts > 0]
-        return int(np.gcd.reduce(np.diff(seen).astype(np.int64))) if seen.size >= _FEWEST_CODES else 1
+        # the distance of fewer codes is chance
+        return int(np.gcd.reduce(np.diff(seen).astype(np.int64))) if seen.size >= 8 else 1
 
     def has_values(self, name: str) -> bool:
         """Return whether a map exists and at least one pixel has a value in it."""

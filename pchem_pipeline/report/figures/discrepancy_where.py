@@ -48,8 +48,8 @@ from pchem_pipeline.report.figures.figure import (
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
 
-#: Colours end at least, and at most, at so many standard deviations.
-_LEAST, _MOST = 4.0, 12.0
+#: Colours end at least at so many standard deviations.
+_LEAST = 4.0
 #: Pixels that stand out are counted, and ringed if they are no more.
 _MOST_RINGS = 60
 
@@ -119,7 +119,9 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
         rms, image = (np.asarray(data.arrays.get(f"{line}_{name}", ())) for name in ("rms", "image"))
         if rms.size:
             tables += _line_tables(line, rms, image, first)
-            words.append(_line_text(line, rms))
+            channels = zip(CHANNELS, map(finite, rms), strict=False)
+            numbers = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
+            words.append(f"{LINE_WORDS[line]}: {' and '.join(numbers) or 'not known'}")
             for channel in ("readout", "charge"):
                 shown = image[CHANNELS.index(channel)] if image.size else None
                 stacks.append(_frames(shown, line, channel, first))
@@ -149,12 +151,6 @@ def _line_tables(line: str, rms: NDArray[Any], image: NDArray[Any], first: int) 
     units = dict.fromkeys(means, "standard deviations")
     shown = DataTable(means, units, f"{line}_means", ("frame", f"{axis} (pixel)"), (0, first))
     return [scatter, shown] if image.size else [scatter]
-
-
-def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
-    channels = zip(CHANNELS, map(finite, rms), strict=False)
-    found = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
-    return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
 class PixelMap(NamedTuple):
@@ -244,7 +240,7 @@ def _sensor_chart(
 def _map_stack(
     each: PixelMap, inside: BoolArray | None, flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
 ) -> Stack:
-    limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
+    limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, 12.0))
     beyond: BoolArray = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT
     rings = np.zeros_like(beyond)
     for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
@@ -314,8 +310,6 @@ def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
     return Stack((panel,), x, f"scatter of the {LINE_WORDS[line]}", height_mm=46.0)
 
 
-#: Number of stretches of the run over which frames are averaged.
-_STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
 _SCALES = {
     "charge": (100.0, "%", "charge: exposure (%)"),
@@ -478,7 +472,7 @@ def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatA
     No stretch spans a gap between the n frames, whose numbers increase.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(number) > 1) + 1, [number.size]])
-    wanted = max(number.size // _STRETCHES, 4)
+    wanted = max(number.size // 24, 4)
     pieces = [np.linspace(a, b, max((b - a) // wanted, 1) + 1)[:-1] for a, b in itertools.pairwise(starts)]
     edges = np.append(np.unique(np.concatenate(pieces).astype(np.int64)), number.size)
     n = np.diff(edges).astype(np.float64)

@@ -18,13 +18,12 @@ from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 
-#: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
-_MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
+#: Points of a curve at most; longer runs are averaged over frames.
+_MOST_POINTS = 1200
 _LINES = ("row", "column")
 #: Values of lines that are worked on at a time.
 _AT_ONCE = 1 << 17
 _EXPECTED = Level(1.0, colour="ink", width=0.6, dash="--")  # sampling noise alone
-_WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
 
 
 def stability_figures(sums: StackSums | None) -> list[Figure]:
@@ -130,7 +129,7 @@ def power_table(sums: StackSums) -> DataTable:
     series = sums.frame_mean - sums.frame_mean.mean()
     power = np.abs(np.fft.rfft(series)[1:]) ** 2 / series.size / max(_chance(sums) ** 2, 1e-300)
     frequency = np.arange(1, power.size + 1) / series.size
-    edges = np.unique(np.geomspace(1, power.size + 1, _MOST_FREQUENCIES).astype(np.int64)) - 1
+    edges = np.unique(np.geomspace(1, power.size + 1, 160).astype(np.int64)) - 1
     starts = edges[:-1] if edges.size > 1 else edges
     lengths = np.diff(np.append(starts, power.size))
     columns = {
@@ -147,7 +146,8 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
     Chance are two standard errors of the median of that many pixels drawn from the whole sensor.
     """
     image, (middle, width) = sums.mean_signal, sums.typical_signal
-    reach = 2.0 * _WIDTH * width / math.sqrt(image.shape[1 - axis])
+    # the standard error of a median is so many times that of a mean
+    reach = 2.0 * math.sqrt(math.pi / 2.0) * width / math.sqrt(image.shape[1 - axis])
     medians = np.median(image, axis=1 - axis)
     columns = {
         "yx"[axis]: np.arange(medians.size),

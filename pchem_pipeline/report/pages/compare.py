@@ -20,13 +20,11 @@ from pchem_pipeline.report.pages.summary import Flag
 from pchem_pipeline.report.pages.tables import RMSES, Table
 
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
-#: Version of the layout of ``compare.json``.
-COMPARE_VERSION = 1
 
 #: At most so many sentences on what changed are shown; the JSON has all.
 _MOST_WORDS = 12
-#: At most so many places are shown in a cell, and pixels in a table; files have all.
-_MOST_PLACES, _MOST_PIXELS = 8, 100
+#: At most so many places are shown in a cell; files have all.
+_MOST_PLACES = 8
 #: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
 _MOST_DRAWN = 8
 
@@ -123,7 +121,7 @@ def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> S
 def _numbers(found: Comparison) -> dict[str, Any]:
     parts = ("median", "median_stderr", "robust_sd")
     return {
-        "compare_version": COMPARE_VERSION,
+        "compare_version": 1,  # of this layout
         "changed": found.changed,
         "sentence": sentence_of(found),
         "tolerance": found.tolerance,
@@ -287,7 +285,7 @@ def _map_table(pair: Pair) -> Table:
 
 
 def _defects(pair: Pair) -> Table:
-    shown, one, other = pair.defects[:_MOST_PIXELS], pair.one.label, pair.other.label
+    shown, one, other = pair.defects[:100], pair.one.label, pair.other.label
     rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
     return Table(
         f"defects-{pair.key}",

@@ -31,7 +31,7 @@ from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, gravest_fi
 from pchem_pipeline.report.pages.tables import Table
 
 #: Longer lists are in ``discrepancy.json`` only.
-_MOST_PLACES, _MOST_CANDIDATES = 12, 8
+_MOST_PLACES = 12
 #: Maps of the survey in words.
 _SURVEYED = {
     "next_x": "neighbours in a row correlated",
@@ -159,7 +159,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
     # an empirical description has no competitors
     several = len(step.candidates) > 1 and step.verdict != "described"
-    for candidate in step.candidates[: _MOST_CANDIDATES if several else 0]:
+    for candidate in step.candidates[: 8 if several else 0]:
         behind = candidate.score - best
         given = [
             f"{name} {f'{value:.3g}' if isinstance(value, int | float) else value}"
@@ -304,8 +304,8 @@ def _examined(data: DiscrepancyData) -> Table:
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
 
-#: Changes of a parameter in standard errors of a pixel: below these negligible, and none.
-_IMMATERIAL, _NOT_MOVED = 0.2, 0.01
+#: Change of a parameter in standard errors of a pixel that is none.
+_NOT_MOVED = 0.01
 #: The parts of the page below the verdict.
 PARTS = (
     Section(
@@ -404,7 +404,7 @@ def key_facts(data: DiscrepancyData) -> list[KeyFact]:
     moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
     name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
     if largest is not None and abs(largest.in_stderr) >= _NOT_MOVED:
-        small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
+        small = ", negligible" if abs(largest.in_stderr) < 0.2 else ""
         value = f"{_signed(largest.median)} {unit_text(largest.unit)}".strip()
         text = f"median over pixels; {_signed(largest.in_stderr)} standard errors of one pixel{small}"
         facts.append(KeyFact(f"largest change: {_parameter_name(name)}", value, (text,)))

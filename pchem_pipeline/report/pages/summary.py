@@ -160,9 +160,6 @@ def nothing_found(look: QuickLook) -> str:
 
 KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "charge_per_level", "quanta_exposure", "bias")
 
-#: Ratio of an RMSE to that of sampling noise alone up to which a significant difference is small, and from
-#: which it is large.
-_RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 #: Share of pixels with one reason for caution from which the first screen says so.
 _CAUTION_SHARE = 0.01
 #: Read noise, e-, above which electrons cannot be counted.
@@ -435,9 +432,9 @@ def _agreement(data: ReportData) -> Iterator[Flag]:
         p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += "" if p is None else f" (chi-square: {p_value_text(p)})"
-        if ratio <= _RMSE_GOOD or (p is not None and p >= SIGNIFICANCE):
+        if ratio <= 1.3 or (p is not None and p >= SIGNIFICANCE):
             yield Flag("good", f"{text}: the model describes the data.")
-        elif ratio <= _RMSE_BAD:
+        elif ratio <= 3.0:
             yield Flag("caution", f"{text}: small differences remain.")
         else:
             yield Flag("serious", f"{text}: the model does not describe the data.")
@@ -590,8 +587,6 @@ def _not_looked_for(data: ReportData) -> str:
 
 #: Stands for the run in a command.
 RUN = "RUN"
-#: Frames that a search for what the model is missing needs.
-_SEARCHED = 600
 
 
 @dataclass(frozen=True)
@@ -647,7 +642,7 @@ def next_steps(data: ReportData) -> list[Step]:
         ]
     if data.mostly_coarse:
         found.append(Step(f"pchem run {RUN}", "set fit.likelihood: auto in the YAML and run again"))
-    if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
+    if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= 600:
         found.append(Step(f"pchem discrepancy {RUN}", "search for effects missing from the model"))
     if not found:
         found.append(Step(f"pchem view {RUN}", "view every pixel in the browser"))

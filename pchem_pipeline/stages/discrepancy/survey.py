@@ -39,10 +39,10 @@ from pchem_pipeline.stages.quick_look import read_sums
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
 
-#: Codes of the tables of a band at most, and rows at least.
-_MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
-#: Bytes of a band for each code of a law, for each pixel, and for each sample that is looked at at once.
-_CODE_BYTES, _PIXEL_BYTES, _SAMPLE_BYTES = 20, 800, 28
+#: Codes of the tables of a band at most.
+_MOST_CODES = 1 << 26
+#: Bytes of a band for each sample that is looked at at once.
+_SAMPLE_BYTES = 28
 #: Such samples at most.
 _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
@@ -134,12 +134,12 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
     """Return the rows of a band, and the samples of its frames looked at at once, within a memory, bytes."""
     ny, nx = shape
     counts = store.array("histogram/counts")
-    fewest = min(ny, _FEWEST_ROWS)
+    fewest = min(ny, 8)
     rows = max(fewest, min(ny, _MOST_CODES // (nx * counts.shape[2])))
     if memory is None:
         return rows, _MOST_AT_ONCE
-    codes = mean_codes(store)
-    pixel = counts.shape[2] * counts.dtype.itemsize + codes * _CODE_BYTES + _PIXEL_BYTES + _SAMPLE_BYTES
+    # bytes for each code of a law, and for each pixel
+    pixel = counts.shape[2] * counts.dtype.itemsize + 20 * mean_codes(store) + 800 + _SAMPLE_BYTES
     left = 0
     for lower in range(rows, fewest - 1, -1):
         left = memory - pairs_bytes((lower, nx))

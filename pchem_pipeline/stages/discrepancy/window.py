@@ -30,8 +30,6 @@ from pchem_pipeline.frames.stream import FrameSource, FrameStream
 #: Bytes of a search: with its program and kernels, however small the window; of a sample; of a pixel, and of
 #: each code of its law. Measured with one worker, 256 to 8190 pixels and 1000 to 6000 frames.
 _PROGRAM_BYTES, _SAMPLE_BYTES, _PIXEL_BYTES, _CODE_BYTES = 290 << 20, 8, 12 << 10, 75
-#: Pixels that a window has at least, and the steps in which it is made smaller.
-_FEWEST_PIXELS, _SMALLER = 256, 0.9
 #: Standard deviations of the largest statistic. Some poor sensors have as many without any effect (of 60 of
 #: all kinds none more than 20), as without simulations their statistics are not quite standard normal: of
 #: these less is compared, with simulations that tell.
@@ -212,8 +210,8 @@ def within_memory(
     """
     window = choose_window(shape, settings, roi)
     while (least := search_bytes(window, codes)) > limit:
-        pixels = int(window.pixels * _SMALLER)
-        if pixels < _FEWEST_PIXELS:
+        pixels = int(window.pixels * 0.9)
+        if pixels < 256:
             raise ConfigError(
                 f"discrepancy needs at least {-(-least >> 20)} MiB, compute.max_memory (--max-memory) allows "
                 f"{limit >> 20}; raise it"
