@@ -55,6 +55,13 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
         for bar in bars
     ]
+    names, unit = ("model", *GapBar._fields[1:]), "1e-6 nats/sample"
+    columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
+    columns["floor"] = [MICRO * floor] * len(bars)
+    tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), unit))]
+    if parts:
+        shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
+        tables.append(DataTable(shares, dict.fromkeys(("before", "after"), unit), "families"))
     yield Figure(
         "discrepancy_gap",
         "shown",
@@ -63,7 +70,7 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "with the next best effect instead, fitted in the same way. Open triangles at the edge are gaps "
         "below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {'; '.join(words)}; floor {micronats(floor)}.",
-        _gap_tables(bars, parts, MICRO * floor),
+        tuple(tables),
         Chart((rows, _family_rows(parts, ends)), (1.0, 1.0), (2, 2)) if parts else Chart((rows,)),
         PAGE_MM,
     )
@@ -92,17 +99,6 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         _pulls_chart(rows),
         PAGE_MM,
     )
-
-
-def _gap_tables(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tuple[DataTable, ...]:
-    names, unit = ("model", *GapBar._fields[1:]), "1e-6 nats/sample"
-    columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
-    columns["floor"] = [floor] * len(bars)
-    whole = DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), unit))
-    if not parts:
-        return (whole,)
-    shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
-    return whole, DataTable(shares, dict.fromkeys(("before", "after"), unit), "families")
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:

@@ -86,13 +86,18 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         return
     origin = data.found.examined.origin
     flagged = [pixel for place in data.found.where for pixel in place.pixels]
-    words = [
-        f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
-        f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
-        + (f", mainly in {each.region.describe()}" if each.region is not None else "")
-        for each in maps
-        for known in [finite(each.z)]
-    ]
+    words, shown, below = [], [], []
+    for each in maps:
+        known, inside, outliers = finite(each.z), _inside(each, origin), count(each.outliers, "pixel")
+        words.append(
+            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
+            f"(expected 0 and 1), {outliers} beyond 5"
+            + (f", mainly in {each.region.describe()}" if each.region is not None else "")
+        )
+        shown.append(_map_stack(each, inside, flagged, origin))
+        edge = float(np.clip(np.abs(known).max(), 5.0, 15.0))
+        part = None if inside is None else each.z[inside]
+        below.append(pull_stack(known, edge, "standard deviations", f"{outliers} beyond ±5", part=part))
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
     yield Figure(
@@ -105,7 +110,7 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "pixels, long tails an effect in few; these are ringed in the map.",
         "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
         (table,),
-        _sensor_chart(maps, flagged, origin),
+        Chart((*shown, *below), (1.0,) * len(maps)),
         PAGE_MM,
     )
 
@@ -115,10 +120,17 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     tables: list[DataTable] = []
     words: list[str] = []
     stacks: list[Stack] = []
-    for line, first in zip(LINE_WORDS, data.found.examined.origin, strict=True):
+    for line, axis, first in zip(LINE_WORDS, "yx", data.found.examined.origin, strict=True):
         rms, image = (np.asarray(data.arrays.get(f"{line}_{name}", ())) for name in ("rms", "image"))
         if rms.size:
-            tables += _line_tables(line, rms, image, first)
+            columns = {axis: first + np.arange(rms.shape[1])}
+            columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
+            tables.append(DataTable(columns, {axis: "pixel"}, f"{line}_scatter"))
+            if image.size:
+                means = dict(zip(CHANNELS, image, strict=False))
+                units = dict.fromkeys(means, "standard deviations")
+                index = ("frame", f"{axis} (pixel)")
+                tables.append(DataTable(means, units, f"{line}_means", index, (0, first)))
             channels = zip(CHANNELS, map(finite, rms), strict=False)
             numbers = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
             words.append(f"{LINE_WORDS[line]}: {' and '.join(numbers) or 'not known'}")
@@ -140,17 +152,6 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
         Chart(tuple(stacks), (1.0, 1.0, 1.0)),
         PAGE_MM,
     )
-
-
-def _line_tables(line: str, rms: NDArray[Any], image: NDArray[Any], first: int) -> list[DataTable]:
-    axis = "y" if line == "row" else "x"
-    columns = {axis: first + np.arange(rms.shape[1])}
-    columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
-    scatter = DataTable(columns, {axis: "pixel"}, f"{line}_scatter")
-    means = dict(zip(CHANNELS, image, strict=False))
-    units = dict.fromkeys(means, "standard deviations")
-    shown = DataTable(means, units, f"{line}_means", ("frame", f"{axis} (pixel)"), (0, first))
-    return [scatter, shown] if image.size else [scatter]
 
 
 class PixelMap(NamedTuple):
@@ -220,21 +221,6 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None) -> Pixel
         6.0 * np.sqrt(outliers),
     )
     return PixelMap(words, z, float(max(departures)), outliers, region)
-
-
-def _sensor_chart(
-    maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
-) -> Chart:
-    shown, below = [], []
-    for each in maps:
-        inside = _inside(each, origin)
-        known = finite(each.z)
-        edge = float(np.clip(np.abs(known).max(), 5.0, 15.0))
-        part = None if inside is None else each.z[inside]
-        note = f"{count(each.outliers, 'pixel')} beyond ±5"
-        shown.append(_map_stack(each, inside, flagged, origin))
-        below.append(pull_stack(known, edge, "standard deviations", note, part=part))
-    return Chart((*shown, *below), (1.0,) * len(maps))
 
 
 def _map_stack(

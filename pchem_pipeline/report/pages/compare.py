@@ -246,10 +246,22 @@ def pair_tables(pair: Pair) -> list[Table]:
         for each in pair.settings
     ]
     versions = [_both("program or algorithm", pair, each) for each in pair.versions]
+    shown, one, other = pair.defects[:100], pair.one.label, pair.other.label
+    rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
+    defects = [
+        {"y": f"{each.y}", "x": f"{each.x}", one: each.before or "none", other: each.now or "none"}
+        for each in shown
+    ]
+    heads = [f"{grade} in {other}" for grade in _GRADES]
+    qualities = [
+        {"": f"{grade} in {one}"} | dict(zip(heads, (f"{int(n):,}" for n in row), strict=True))
+        for grade, row in zip(_GRADES, pair.transitions, strict=False)
+    ]
+    kinds = f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}"
     tables = (
         _map_table(pair),
-        _defects(pair),
-        _transitions(pair),
+        Table(f"defects-{pair.key}", "Defects that changed", kinds, defects),
+        Table(f"quality-{pair.key}", "Pixels by quality", "", qualities),
         Table(f"settings-{pair.key}", "Settings that differ", "", settings),
         Table(f"versions-{pair.key}", "Versions that differ", "", versions),
     )
@@ -282,29 +294,6 @@ def _map_table(pair: Pair) -> Table:
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
         rows,
     )
-
-
-def _defects(pair: Pair) -> Table:
-    shown, one, other = pair.defects[:100], pair.one.label, pair.other.label
-    rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
-    return Table(
-        f"defects-{pair.key}",
-        "Defects that changed",
-        f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}",
-        [
-            {"y": f"{each.y}", "x": f"{each.x}", one: each.before or "none", other: each.now or "none"}
-            for each in shown
-        ],
-    )
-
-
-def _transitions(pair: Pair) -> Table:
-    heads = [f"{grade} in {pair.other.label}" for grade in _GRADES]
-    rows = [
-        {"": f"{grade} in {pair.one.label}"} | dict(zip(heads, (f"{int(n):,}" for n in row), strict=True))
-        for grade, row in zip(_GRADES, pair.transitions, strict=False)
-    ]
-    return Table(f"quality-{pair.key}", "Pixels by quality", "", rows)
 
 
 def _both(what: str, pair: Pair, each: Setting) -> dict[str, str]:

@@ -36,6 +36,7 @@ from pchem_pipeline.run.stage import WHOLE, Named, StageContext
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.survey import mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
+    SURVEY,
     Survey,
     Window,
     choose_window,
@@ -150,9 +151,10 @@ class _Search:
                     "smaller errors raise discrepancy.clear_samples"
                 )
                 seen = scanned(few)
-            known = {"window": _amounts(few), "whole": _amounts(settings), **seen.numbers()}
+            known = SURVEY.dump_python(seen, mode="json")
+            known |= {"window": _amounts(few), "whole": _amounts(settings)}
             context.run_units([WHOLE], lambda *_: known, total=1)
-        self.seen = Survey.of_numbers(known)
+        self.seen = SURVEY.validate_python(known)
         few, most = (
             settings.model_copy(update=known.get(name, known["window"])) for name in ("window", "whole")
         )

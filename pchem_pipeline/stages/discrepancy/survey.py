@@ -33,7 +33,7 @@ from pchem_pipeline.model.arithmetic.significance import NO_CHANCE, SIGNIFICANCE
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
-from pchem_pipeline.stages.discrepancy.window import PAIRS, SHAPES, SUMS, Survey, frame_blocks
+from pchem_pipeline.stages.discrepancy.window import PAIRS, SHAPES, SUMS, Spot, Survey, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
 from pchem_pipeline.store.run_store import RunStore
@@ -66,7 +66,8 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
         memory = None if limit is None else (limit << 20) - resident_bytes()
         here, more = places_of_bands(store, source, plain=not model.effects, memory=memory, left_out=left_out)
         places, shares = (places or {}) | here, shares | more
-    return Survey(places or {}, shares, tuple(left_out.tolist()), tuple(odd["copied"].tolist()))
+    spots = {name: Spot(each.region, each.p) for name, each in (places or {}).items()}
+    return Survey(spots, shares, tuple(left_out.tolist()), tuple(odd["copied"].tolist()))
 
 
 def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, Suspect] | None:

@@ -58,26 +58,17 @@ _HISTOGRAM = ("origin", "minimum", "maximum")
 
 @dataclass(frozen=True)
 class _Job:
-    """What the ensemble is of.
-
-    Attributes:
-        tiles: number and place of each tile by its key.
-        frames: the chosen frames (first, end), or None where there are none to choose from.
-        source: where frames come from, if any are read.
-        truth: first row, first column and first frame of the input in the true electron numbers, or None.
-        effects: with which the maps were fitted.
-        limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
-    """
+    """What the ensemble is of."""
 
     config: RunConfig
     sensor: SensorInfo
     axes: EnsembleAxes
-    tiles: dict[str, tuple[int, Tile]]
-    frames: tuple[int, int] | None
-    source: FrameSource | None
-    truth: tuple[int, int, int] | None
-    effects: tuple[Effect, ...]
-    limits: tuple[int, int] | None
+    tiles: dict[str, tuple[int, Tile]]  # number and place of each by its key
+    frames: tuple[int, int] | None  # the chosen ones (first, end); None where there are none to choose from
+    source: FrameSource | None  # where frames come from, if any are read
+    truth: tuple[int, int, int] | None  # row, column and frame of the input in the true electron numbers
+    effects: tuple[Effect, ...]  # with which the maps were fitted
+    limits: tuple[int, int] | None  # codes of the ADC, DN, where samples lie at one of them
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,6 @@ from pchem_pipeline.store.tiles import Tile, equal_rows
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
-_LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 
 
 def run(context: StageContext) -> None:
@@ -173,14 +172,10 @@ def judge_sensor(context: StageContext) -> int:
     store, shape = context.store, context.sensor.shape
     bands = [(slice(*rows), slice(0, shape[1])) for rows in equal_rows(shape[0], context.tile[0])]
     every = -(-shape[0] * shape[1] // _LARGEST_POOL)
-    kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
     chosen = []
     for band in bands:
-        pixels = _judged(store, band)
-        some = pixels.of(slice(-band[0].start * shape[1] % every, None, every))
+        some = _judged(store, band).of(slice(-band[0].start * shape[1] % every, None, every))
         chosen.append(Judged.join([some]))  # a copy: a view would keep the whole band
-        if shape[0] * shape[1] <= _LARGEST_KEPT:
-            kept[band[0].start] = pixels
     pool = NoisePool.of(Judged.join(chosen))
     weakly, unsure = (np.uint16(int(bit)) for bit in (FitStatus.WEAKLY_IDENTIFIED, FitStatus.BIAS_UNSURE))
     found = 0
@@ -188,7 +183,7 @@ def judge_sensor(context: StageContext) -> int:
         words = store.read("fit/fit_status", band)
         new = words & ~(weakly | unsure)
         if pool is not None:
-            pixels = kept[band[0].start] if kept else _judged(store, band)
+            pixels = _judged(store, band)
             weak, ambiguous = pool.reasons(pixels, context.config.fit)
             exposure = store.read("fit/quanta_exposure", band).ravel()
             of_gain = bool(context.sensor.samples) | moves_gain(exposure, pixels.noise)
