@@ -261,8 +261,30 @@ def embedded(data: ReportData) -> dict[str, Any] | None:
     shown = data.inspector()
     content = {f"map-{i}": each.packed.data for i, each in enumerate(shown.maps) if each.packed is not None}
     content["inspector-sample"] = _sample_bytes(shown.sample)
+    sample = shown.sample
+    facts = {
+        "shape": list(data.shape),
+        "noun": data.noun,
+        "channels": list(data.channel_names),
+        "samples": "samples" if data.shape[0] == 1 else "frames",
+        "statusWords": {str(int(bit)): text for bit, text in MEANINGS.items()},
+        "failedMask": int(FAILED),
+        "model": data.run.get("model", ""),
+        "command": shown.command,
+        "keptTo": shown.kept_to,
+        "colours": shades().tobytes().hex(),
+        "maps": [map_facts(entry) for entry in shown.maps],
+        "panel": list(PANEL_MAPS),
+        "sample": {
+            "n": int(sample.index.size),
+            "exact": list(sample.exact),
+            "deciding": sample.deciding is not None,
+            "masses": len(sample.masses),
+        },
+        "notable": [each._asdict() for each in sample.reasons],
+    }
     return {
-        "facts": json_for_html(_facts(data, shown)),
+        "facts": json_for_html(facts),
         "blobs": {name: Markup(_base64(each)) for name, each in content.items()},
         "script": Markup(text_of("inspector.js")),
     }
@@ -302,31 +324,6 @@ def json_for_html(content: Any) -> Markup:
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
     return Markup(text)
-
-
-def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
-    sample = shown.sample
-    return {
-        "shape": list(data.shape),
-        "noun": data.noun,
-        "channels": list(data.channel_names),
-        "samples": "samples" if data.shape[0] == 1 else "frames",
-        "statusWords": {str(int(bit)): text for bit, text in MEANINGS.items()},
-        "failedMask": int(FAILED),
-        "model": data.run.get("model", ""),
-        "command": shown.command,
-        "keptTo": shown.kept_to,
-        "colours": shades().tobytes().hex(),
-        "maps": [map_facts(entry) for entry in shown.maps],
-        "panel": list(PANEL_MAPS),
-        "sample": {
-            "n": int(sample.index.size),
-            "exact": list(sample.exact),
-            "deciding": sample.deciding is not None,
-            "masses": len(sample.masses),
-        },
-        "notable": [each._asdict() for each in sample.reasons],
-    }
 
 
 def map_facts(entry: MapEntry) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from pchem_pipeline.base.wording import (
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples, truth_errors
+from pchem_pipeline.report.data import ReportData, truth_errors
 from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
@@ -100,7 +100,19 @@ def _parameters(data: ReportData) -> Table:
         f"Median over the {data.noun}s with its standard error, robust standard deviation between "
         f"{data.noun}s (1.4826 MAD), median 1 sigma error per {data.noun}, percentiles, and outliers beyond "
         f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
-        [_parameter_row(data, name) for name in _known(data)],
+        [
+            {
+                "parameter": heading(name),
+                "median": measured(summary.median, summary.median_stderr),
+                "spread": short(summary.robust_sd),
+                f"error per {data.noun}": "not known" if error is None else short(error, 2),
+                **{f"{p:g} %": short(value, 4) for p, value in summary.percentiles.items() if p != 50.0},
+                "outliers": f"{summary.n_low + summary.n_high:,}",
+                "pixels": f"{summary.n_valid:,}",
+            }
+            for name in _known(data)
+            for summary, error in [(data.summary(name), data.pixel_error(name))]
+        ],
     )
 
 
@@ -137,19 +149,6 @@ def _overscan(data: ReportData) -> Table:
 def _known(data: ReportData) -> list[str]:
     """Return the maps that have values, in the order of the tables."""
     return [name for name in MAPS if data.has_values(name)]
-
-
-def _parameter_row(data: ReportData, name: str) -> Row:
-    summary, error = data.summary(name), data.pixel_error(name)
-    return {
-        "parameter": heading(name),
-        "median": measured(summary.median, summary.median_stderr),
-        "spread": short(summary.robust_sd),
-        f"error per {data.noun}": "not known" if error is None else short(error, 2),
-        **{f"{p:g} %": short(value, 4) for p, value in summary.percentiles.items() if p != 50.0},
-        "outliers": f"{summary.n_low + summary.n_high:,}",
-        "pixels": f"{summary.n_valid:,}",
-    }
 
 
 def _left_out(data: ReportData) -> str:
@@ -303,10 +302,7 @@ def _intervals(data: ReportData) -> Table:
             f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood "
             "interval from the estimate, in standard errors."
         )
-    return Table("uncertainties", "Uncertainties", words, list(_interval_rows(data)), "uncertainty")
-
-
-def _interval_rows(data: ReportData) -> Iterator[Row]:
+    rows = []
     for name in _known(data):
         error, summary = data.pixel_error(name, with_flagged=True), data.summary(name, with_flagged=True)
         if error is None:
@@ -327,42 +323,43 @@ def _interval_rows(data: ReportData) -> Iterator[Row]:
                 low, high = data.intervals[name]
                 ends = [short(float(np.nanmedian(part / errors))) for part in (values - low, high - values)]
             row |= dict(zip(("profile: below", "profile: above"), ends, strict=True))
-        yield row
+        rows.append(row)
+    return Table("uncertainties", "Uncertainties", words, rows, "uncertainty")
 
 
 def _samples(data: ReportData) -> Table | None:
-    if data.samples is None:
+    found, rows = data.samples, []
+    if found is None:
         return None
-    p = finite(data.samples.arrays.get("linearity_p", np.empty(0)))
+    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
+    for i, sample in enumerate(found.samples):
+        centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
+        residual = share = "–"
+        if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
+            rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
+            residual = measured(rest, rest_error)
+            if centre > 0:
+                share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
+        rows.append(
+            {
+                "sample": sample.name,
+                f"{words} ({unit})" if unit else words: "–" if sample.x is None else f"{sample.x:g}",
+                "frames": f"{sample.n_frames:,}",
+                "H (e⁻)": "0 (bias)" if sample.kind == "bias" else measured(centre, error),
+                "residual (e⁻)": residual,
+                "residual / H": share,
+            }
+        )
+    p = finite(found.arrays.get("linearity_p", np.empty(0)))
     off = percent(int((p < 0.01).sum()), p.size)
     remark = f" {off} of the {data.noun}s are off the line (p < 0.01; 1 % expected)." if p.size else ""
     return Table(
         "samples",
         "Samples",
         f"Medians over the {data.noun}s, with their standard errors.{remark}",
-        [_sample_row(data.samples, i) for i in range(len(data.samples.samples))],
+        rows,
         "exposures",
     )
-
-
-def _sample_row(found: Samples, i: int) -> Row:
-    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
-    sample = found.samples[i]
-    centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
-    residual = share = "–"
-    if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
-        rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
-        residual = measured(rest, rest_error)
-        if centre > 0:
-            share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
-    return {
-        "sample": sample.name,
-        f"{words} ({unit})" if unit else words: "–" if sample.x is None else f"{sample.x:g}",
-        "frames": f"{sample.n_frames:,}",
-        "H (e⁻)": "0 (bias)" if sample.kind == "bias" else measured(centre, error),
-        "residual (e⁻)": residual,
-        "residual / H": share,
-    }
 
 
 def _plan(data: ReportData) -> Table | None:

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
@@ -101,8 +101,10 @@ def places_of_bands(
     places: dict[str, Suspect] = {}
     for first, last in bands:
         fitted, laws = _laws(store, (first, last))
-        for name, values in _shapes(laws, fitted.usable.shape).items():
-            maps[name].add(values, first)
+        shapes = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
+        shapes["goodness"] = goodness_of(laws.moments["goodness"])
+        for name, values in shapes.items():
+            maps[name].add(np.where(laws.good, values, np.nan).reshape(last - first, nx), first)
         if not laws.good.any():
             continue
         blocks = partial(frame_blocks, source, numbers, (first, last))
@@ -183,9 +185,3 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     seen = PixelHistograms(counts.reshape(-1, counts.shape[2]), origin, beyond)
     laws = pixel_laws(seen, maps.columns, usable.ravel())
     return replace(maps, usable=laws.good.reshape(usable.shape)), laws
-
-
-def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
-    found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
-    found["goodness"] = goodness_of(laws.moments["goodness"])
-    return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}

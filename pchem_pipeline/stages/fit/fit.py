@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.expected_information import (
@@ -132,7 +132,11 @@ def _do_tile(
                 whole[variable.index(part)] = values
     for each in runs:
         if each.has("frames/excluded"):
-            _leave_out(arrays, each.read("frames/excluded", tile.region) != 0)
+            excluded = each.read("frames/excluded", tile.region) != 0
+            for path, values in arrays.items():
+                if values.dtype.kind == "f":
+                    values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
+            arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
     store.at(tile.region).update(arrays)
     words = arrays["fit/fit_status"]
     summary: dict[str, Any] = {
@@ -147,14 +151,6 @@ def _do_tile(
         biased = biased_by_rounding([values.ravel() for values in maps], frames.ravel())
         summary["rounded"] = int(np.count_nonzero(biased))
     return summary
-
-
-def _leave_out(arrays: Arrays, excluded: BoolArray) -> None:
-    """Take the values of excluded pixels (y, x) out of the arrays of a tile, and give them their word."""
-    for path, values in arrays.items():
-        if values.dtype.kind == "f":
-            values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
-    arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
 
 
 # -- what all pixels of the sensor together say about the fit of each ------------------------------

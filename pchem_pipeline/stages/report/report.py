@@ -82,18 +82,14 @@ def _write(
         store.write_file(name, text.encode())
     if DISCREPANCY_PAGE not in files:
         (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
-    return {"warnings": _warnings(data)}
-
-
-def _warnings(data: ReportData) -> list[str]:
-    """Return what the quick look found that is more than a remark, for the terminal."""
     look = data.quick_look
     if look is None or data.discrepancy is not None:
-        return []
+        return {}
+    # what is more than a remark is told in the terminal, too
     found = [check_sentence(check) for check in look.found if check.level in ("caution", "serious")]
-    if not found or look.found[0].name == "levels":
-        return found
-    return [*found, f"to look closer: {look.command}"]
+    if found and look.found[0].name != "levels":
+        found.append(f"to look closer: {look.command}")
+    return {"warnings": found}
 
 
 def gather(
