@@ -215,6 +215,18 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
             columns[f"{name} {words}"] = [float(row[f"{name}_{part}"] or "nan") for row in rows]
             units[f"{name} {words}"] = stored_unit(name)
     table = DataTable(columns, units)
+    order = np.argsort(at, kind="stable")
+    panels = []
+    for name in shown:
+        median, error, scatter = (np.array(columns[f"{name} {words}"])[order] for words in parts)
+        marks = (
+            Band(at[order], median - scatter, median + scatter, alpha=0.15, label="scatter of the pixels"),
+            Line(at[order], median),
+            Points(at[order], median, size=3.0, error=np.stack([error, error]), label="median"),
+        )
+        sign, _, unit = symbol(name)
+        panels.append(Panel(Axis(f"{sign} ({unit})"), marks))
+    x = Axis(axis, ticks=() if ordered else _labels(rows))
     words = "; ".join(
         f"{noun} from {short(medians[0])} to {short(medians[-1])} {unit}"
         for medians, (_, noun, unit) in ((columns[f"{name} median"], symbol(name)) for name in shown)
@@ -226,7 +238,7 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
         "Medians of the maps with their standard errors; band: scatter of the pixels.",
         f"From {rows[0]['label']} to {rows[-1]['label']}: {words}.",
         (table,),
-        _history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
+        Chart((Stack(tuple(panels), x, height_mm=26.0 * len(shown) + 10.0),)),
         PAGE_MM,
     )
 
@@ -246,24 +258,3 @@ def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
         texts = [str(i + 1) for i in range(len(rows))]
     every = -(-len(rows) // 12)
     return tuple((float(i), texts[i]) for i in range(0, len(rows), every))
-
-
-def _history_chart(
-    table: DataTable, names: tuple[str, ...], axis: str, ticks: tuple[tuple[float, str], ...] = ()
-) -> Chart:
-    order = np.argsort(table[axis], kind="stable")
-    at = table[axis].astype(np.float64)[order]
-    panels = []
-    for name in names:
-        median, error, scatter = (
-            table[f"{name} {part}"].astype(np.float64)[order]
-            for part in ("median", "standard error", "scatter")
-        )
-        marks = (
-            Band(at, median - scatter, median + scatter, alpha=0.15, label="scatter of the pixels"),
-            Line(at, median),
-            Points(at, median, size=3.0, error=np.stack([error, error]), label="median"),
-        )
-        sign, _, unit = symbol(name)
-        panels.append(Panel(Axis(f"{sign} ({unit})"), marks))
-    return Chart((Stack(tuple(panels), Axis(axis, ticks=ticks), height_mm=26.0 * len(names) + 10.0),))

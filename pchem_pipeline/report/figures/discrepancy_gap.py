@@ -83,11 +83,24 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         return
     names = ("statistic", "sentence", "before", "after")
     columns = {name: [getattr(row, name) for row in rows] for name in names}
-    words = []
-    for row in rows[:6]:
-        after = f", after {row.after:+.1f}" if math.isfinite(row.after) else ""
-        before = f"{row.before:+.1f}" if math.isfinite(row.before) else "not known"
-        words.append(f"{row.sentence or row.statistic}: before {before}{after}")
+    words = [
+        f"{pull.sentence or pull.statistic}: before "
+        + (f"{pull.before:+.1f}" if math.isfinite(pull.before) else "not known")
+        + (f", after {pull.after:+.1f}" if math.isfinite(pull.after) else "")
+        for pull in rows[:6]
+    ]
+    marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
+    places = np.arange(len(rows))
+    values = {role: np.array(columns[role]) for role in ("before", "after")}
+    for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
+        marks += _bar_line(row, before, after, "bars", 1.4)
+    for role, label in (("before", "plain model"), ("after", "with effects")):
+        known = np.isfinite(values[role])
+        if known.any():
+            colour, shape = _ROLES[role]
+            marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=label))
+    reach = float(np.nanmax(np.abs([*values.values()]), initial=6.0))
+    x = pull_axis("deviation (sigma)", 1.4 * reach)
     yield Figure(
         "discrepancy_pulls",
         "shown",
@@ -96,7 +109,7 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Gray: 2 sigma. Sampling noise makes the largest of some hundred 3 sigma, counts of few pixels more.",
         f"In sigma. {'; '.join(words).replace('-', '−')}.",
         (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
-        _pulls_chart(rows),
+        Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2)),
         PAGE_MM,
     )
 
@@ -238,19 +251,3 @@ def _point(value: float, row: int, left: float, role: str, label: str = "") -> P
     if value > left:
         return Points(np.array([value]), y, shape, 5.0, colour=colour, label=label)
     return Points(np.array([left * 1.12]), y, "<", 5.0, face="paper", colour=colour)
-
-
-def _pulls_chart(rows: Sequence[Pull]) -> Chart:
-    marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
-    places = np.arange(len(rows))
-    values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}
-    for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
-        marks += _bar_line(row, before, after, "bars", 1.4)
-    for role, words in (("before", "plain model"), ("after", "with effects")):
-        known = np.isfinite(values[role])
-        if known.any():
-            colour, shape = _ROLES[role]
-            marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
-    reach = float(np.nanmax(np.abs([*values.values()]), initial=6.0))
-    x = pull_axis("deviation (sigma)", 1.4 * reach)
-    return Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))
