@@ -116,31 +116,26 @@ def same_sensor(samples: Sequence[OpenSample]) -> None:
     Raises:
         ConfigError: they have not.
     """
-    for i in range(1, len(samples)):
-        _same_sensor(samples[:i], samples[i])
-
-
-def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
-    """Compare a sample with those before it."""
-    first = others[0]
-    here, there = mine.sensor, first.sensor
-    sizes = [f"{each.ny} x {each.nx}" for each in (here, there)]
-    regions = [str(each.target.config.input.roi) for each in (mine, first)]
-    same_region = "all samples must show the same region of one sensor"
-    same_sensor = "all samples must come from one sensor with the same settings"
-    for facts, words, rule in (
-        (sizes, "has {} pixels, {} {}", same_region),
-        ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", same_sensor),
-        (regions, "is cropped to {} (input.roi), {} to {}", same_region),
-    ):
-        if None not in facts and facts[0] != facts[1]:
-            found = words.format(facts[0], first.where, facts[1])
-            raise ConfigError(f"{mine.where} {found}; {rule}")
-    if found := unlike(here.camera, there.camera, first.where):
-        raise ConfigError(f"{mine.where}: {found}; {same_sensor}")
-    for other in others:
-        if mine.shares_frames(other):
-            raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
+    region = "all samples must show the same region of one sensor"
+    sensor = "all samples must come from one sensor with the same settings"
+    first = samples[0]
+    for i, mine in enumerate(samples[1:], 1):
+        here, there = mine.sensor, first.sensor
+        sizes = [f"{each.ny} x {each.nx}" for each in (here, there)]
+        regions = [str(each.target.config.input.roi) for each in (mine, first)]
+        for facts, words, rule in (
+            (sizes, "has {} pixels, {} {}", region),
+            ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", sensor),
+            (regions, "is cropped to {} (input.roi), {} to {}", region),
+        ):
+            if None not in facts and facts[0] != facts[1]:
+                found = words.format(facts[0], first.where, facts[1])
+                raise ConfigError(f"{mine.where} {found}; {rule}")
+        if found := unlike(here.camera, there.camera, first.where):
+            raise ConfigError(f"{mine.where}: {found}; {sensor}")
+        for other in samples[:i]:
+            if mine.shares_frames(other):
+                raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
 
 
 def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> FloatArray | None:

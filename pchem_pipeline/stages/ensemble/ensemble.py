@@ -343,7 +343,22 @@ def _write_result(
         with np.errstate(divide="ignore"):  # one whose H, or gain, is more open may be off by any number
             wide = np.minimum(2.0 * pixels.maps[0] ** 2 / per_pixel, 0.5 / gap) > 0.25
         weight = bias_weight(np.where(wide | (words & int(flags_of("conversion_gain")) != 0), 0.0, gap))
-    true = _true_pixels(store, job, fitted.place)
+    true, simulated = None, job.config.simulate
+    if job.truth is not None and simulated is not None and not simulated.effects:
+        # of the pixels with a value, if they are all that made the frames
+        (y0, x0, _), (ny, nx) = job.truth, job.sensor.shape
+        truth = store.at((slice(y0, y0 + ny), slice(x0, x0 + nx)), "truth")
+        of_truth, known = UsablePixels.from_maps([truth[name][fitted.place] for name in PARAMETERS])
+        true = of_truth if known.all() else None
+    missing: dict[str, str] = {}
+    if frames is None:
+        missing["frames"] = f"input is {job.sensor.kind}: the ensemble has all samples"
+    if totals.count("compared") == 0:
+        missing["truth"] = (
+            "unknown true electron numbers"
+            if simulated is None
+            else "no true electron numbers stored for these frames"
+        )
     arrays, found = curves(totals, pixels, settings, job.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
     arrays |= numbers | components(pixels, numbers["electron_pmf"], weight)
@@ -360,35 +375,10 @@ def _write_result(
             totals, pixels, per_pixel, weight, extended=bool(job.effects) or job.limits is not None
         ),
         "component_cases": COMPONENT_CASES,
-        "missing": _missing(job, totals),
+        "missing": missing,
     }
     if job.effects:
         found["model"] = model_words(job.effects)
     for name, values in arrays.items():
         store.write_array(f"ensemble/{name}", values)
     store.set_attributes("ensemble", plain(found | facts))
-
-
-def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels | None:
-    """Return the true parameters of the pixels with a value, if they are all that made the frames."""
-    simulated = job.config.simulate
-    if job.truth is None or simulated is None or simulated.effects:
-        return None
-    y0, x0, _ = job.truth
-    ny, nx = job.sensor.shape
-    truth = store.at((slice(y0, y0 + ny), slice(x0, x0 + nx)), "truth")
-    true, known = UsablePixels.from_maps([truth[name][place] for name in PARAMETERS])
-    return true if known.all() else None
-
-
-def _missing(job: _Job, totals: EnsembleTotals) -> dict[str, str]:
-    missing: dict[str, str] = {}
-    if job.frames is None:
-        missing["frames"] = f"input is {job.sensor.kind}: the ensemble has all samples"
-    if totals.count("compared") == 0:
-        missing["truth"] = (
-            "unknown true electron numbers"
-            if job.config.simulate is None
-            else "no true electron numbers stored for these frames"
-        )
-    return missing
