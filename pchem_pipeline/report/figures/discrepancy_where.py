@@ -340,7 +340,20 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of the frames along the run."""
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
         return
-    frames, stretches = _frame_tables(data.arrays)
+    arrays, units = data.arrays, dict[str, str]()
+    number = np.asarray(arrays["frame_number"], dtype=np.float64)
+    columns, means = {"frame": number}, dict[str, FloatArray]()
+    for channel, (scale, unit, _) in _SCALES.items():
+        if f"frame_{channel}" not in arrays:
+            continue
+        columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
+        centre, means[channel], n = trends(number, columns[channel])
+        path = arrays.get(f"frame_{channel}_model")
+        if path is not None and path.size:
+            columns[_model(channel)] = scale * np.asarray(path, dtype=np.float64)
+        units |= dict.fromkeys((channel, _model(channel)), unit)
+    frames = DataTable(columns, units)
+    stretches = DataTable({"frame": centre, "frames": n, **means}, units, "stretches")
     by_channel = data.arrays.get("frame_sd", np.full(2, np.nan)).tolist()
     sds = dict(zip((*CHANNELS, "noise"), (*by_channel, 1.0), strict=True))
     sds = {shown: sd for shown, sd in sds.items() if shown in frames}
@@ -354,7 +367,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
             f"{channel}: standard deviation {short(float(values.std()))} {unit}{chance}, change "
             f"along the run {short(drift)} {unit}"
         )
-    path = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
+    drawn = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
     yield Figure(
         "discrepancy_frames",
         "where",
@@ -362,7 +375,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame "
         "(noise). Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. "
         "Dashed: time course of the named effects, if deterministic. Yellow: frames named in the verdict.",
-        f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
+        f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{drawn}.",
         (frames, stretches),
         _frames_chart(frames, stretches, sds, data.found.where),
         PAGE_MM,
@@ -393,22 +406,6 @@ def code_table(arrays: Arrays) -> DataTable:
 
 
 _NAMED = "expected with added effects"
-
-
-def _frame_tables(arrays: Arrays) -> tuple[DataTable, DataTable]:
-    number = np.asarray(arrays["frame_number"], dtype=np.float64)
-    columns, means = {"frame": number}, dict[str, FloatArray]()
-    units: dict[str, str] = {}
-    for channel, (scale, unit, _) in _SCALES.items():
-        if f"frame_{channel}" not in arrays:
-            continue
-        columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
-        centre, means[channel], n = trends(number, columns[channel])
-        path = arrays.get(f"frame_{channel}_model")
-        if path is not None and path.size:
-            columns[_model(channel)] = scale * np.asarray(path, dtype=np.float64)
-        units |= dict.fromkeys((channel, _model(channel)), unit)
-    return DataTable(columns, units), DataTable({"frame": centre, "frames": n, **means}, units, "stretches")
 
 
 def _model(channel: str) -> str:
