@@ -29,7 +29,7 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     store = target.stored()
     # before anything of an earlier comparison is given up
     if store.has("histogram/counts"):
-        open_other_runs(store, target.base_dir, changed.config.methods.with_runs)
+        open_other_runs(target, changed.config.methods.with_runs)
     run_stages(target, ["methods"], replace(command, settings=tuple(values.items())))
     if command.dry_run:
         return ""

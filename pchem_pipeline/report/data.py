@@ -49,9 +49,6 @@ LINE_MAPS = ("charge_per_level", "spurious_charge", "dark_signal")
 #: Order of the axis ``channel`` of the arrays of a verdict.
 CHANNELS = ("charge", "readout")
 
-#: Codes from which their distance is known.
-_FEWEST_CODES = 8
-
 
 def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, int]]:
     """Return each reason for caution or failure, gravest first: bit, sentence, pixels that have it."""
@@ -256,7 +253,8 @@ class ReportData:
         """Distance in DN at which codes occur in the whole sensor: 1, or 4 if left-justified by 2 bits."""
         dn, counts = (self.ensemble.get(name) for name in ("dn", "counts"))
         seen = np.empty(0) if dn is None or counts is None else dn[counts > 0]
-        return int(np.gcd.reduce(np.diff(seen).astype(np.int64))) if seen.size >= _FEWEST_CODES else 1
+        # the distance of fewer codes is chance
+        return int(np.gcd.reduce(np.diff(seen).astype(np.int64))) if seen.size >= 8 else 1
 
     def has_values(self, name: str) -> bool:
         """Return whether a map exists and at least one pixel has a value in it."""
@@ -293,12 +291,11 @@ class ReportData:
 
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
         """Describe a map, once, by order statistics of all pixels with a value or of unflagged ones."""
-        if (name, with_flagged) not in self._summaries:
-            self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
-            if self.flagged.any():
-                known = Ordered.of(self.maps[name], self.flagged_in(name))
-                self._summaries[name, False] = self._summarised(known)
-        return self._summaries[name, with_flagged]
+        key = name, with_flagged or not bool(self.flagged.any())
+        if key not in self._summaries:
+            known = self.ordered(name) if key[1] else Ordered.of(self.maps[name], self.flagged_in(name))
+            self._summaries[key] = self._summarised(known)
+        return self._summaries[key]
 
     @property
     def overscan_medians(self) -> dict[str, Any]:
@@ -319,6 +316,11 @@ class ReportData:
 
     def _summarised(self, known: Ordered) -> MapSummary:
         return summarise(known, outlier_sigmas=self.outlier_sigmas)
+
+    def estimate(self, name: str, y: int, x: int) -> tuple[float, float]:
+        """Return the value of a pixel in a map with its standard error; NaN if unknown."""
+        errors = self.maps.get(f"{name}_stderr")
+        return float(self.maps[name][y, x]), np.nan if errors is None else float(errors[y, x])
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
         """Return the median standard error of a pixel, of all or of those without a flag; None if unknown."""

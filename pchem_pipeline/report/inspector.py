@@ -34,10 +34,6 @@ from pchem_pipeline.report.style.ranges import DECADES
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 #: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
 _TAIL = 1e-3
-#: Step of logarithmic maps: 2.3 %.
-_LOG_STEP = 0.01
-#: Bars of a map's histogram, at least and at most.
-_FEWEST_BARS, _MOST_BARS = 8, 96
 
 
 @dataclass(frozen=True)
@@ -50,22 +46,13 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Bars:
-    """Histogram of a map whose codes are too coarse to show one: ``parts`` bars a code, from ``first`` on."""
-
-    first: int
-    parts: int
-    counts: IntArray
-
-
-@dataclass(frozen=True)
 class PackedMap:
     """A map in few bytes."""
 
     scale: Scale  # how codes stand for values
     n_odd: int  # values outside the range of the codes, at the end of ``data`` as indices and float32
     data: bytes  # gzip of low bytes, high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian
-    bars: Bars | None = None  # its histogram; None where the codes are fine enough
+    bars: dict[str, Any] | None = None  # see `_bars`; None where the codes are fine enough
 
 
 def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:
@@ -90,7 +77,7 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     low, q25, middle, q75, high = known.quantiles([_TAIL, 0.25, 0.5, 0.75, 1.0 - _TAIL]).tolist()
     margin = 3.0 * (high - low)
     first, last = max(float(known.values[0]), low - margin), min(float(known.values[-1]), high + margin)
-    fine = _LOG_STEP if log else step or float(q75 - q25) / 1.35 / 64.0
+    fine = 0.01 if log else step or float(q75 - q25) / 1.35 / 64.0
     smallest = max((last - first) / (_LAST - _FIRST - 257), abs(float(middle)) * 1e-9, 1e-300)
     wide = float(max(fine * coarse, smallest))
     # the median in the middle of 256 codes: where these hold the bulk, the high bytes cost next to nothing
@@ -140,10 +127,11 @@ def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
     return place
 
 
-def _bars(place: FloatArray) -> Bars | None:
+def _bars(place: FloatArray) -> dict[str, Any] | None:
     """Return the histogram over the bulk of a map's places; None where codes are narrow enough to be bars.
 
-    Its axis is the script's: from the 1st to the 99th percentile, and 0.3 of it beyond where values are.
+    It has the ``counts`` of ``parts`` bars a code, from the code ``first`` on. Its axis is the script's: from
+    the 1st to the 99th percentile, and 0.3 of it beyond where values are.
     """
     known = Ordered.of(some_of(place))
     if known.size < 2:
@@ -152,13 +140,13 @@ def _bars(place: FloatArray) -> Bars | None:
     margin = 0.3 * (high - low)
     ends = max(low - margin, known.values[0], 0.0), min(high + margin, known.values[-1])
     first, last = np.rint(ends).astype(int)
-    wanted = np.clip(2.0 * np.cbrt(place.size), _FEWEST_BARS, _MOST_BARS)
+    wanted = np.clip(2.0 * np.cbrt(place.size), 8, 96)
     parts = round(float(wanted) / max(int(last - first) + 1, 1))
     if parts < 2 or not high > low:
         return None
     n, bar = int(last - first + 1) * parts, (place - (first - 0.5)) * parts
     inside = bar[(bar >= 0.0) & (bar < n)].astype(np.int64)
-    return Bars(int(first) + _FIRST, parts, np.bincount(inside, minlength=n))
+    return {"first": int(first) + _FIRST, "parts": parts, "counts": np.bincount(inside, minlength=n).tolist()}
 
 
 def varints(values: NDArray[Any]) -> bytes:
@@ -239,8 +227,8 @@ class InspectorData:
     command: str  # what shows every pixel
 
 
-#: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
-_CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
+#: The part of the policy that forbids every connection.
+_CONNECT_NOWHERE = "connect-src 'none'"
 
 #: Values in the table of a pixel, in its order; the others follow below.
 PANEL_MAPS = (
@@ -273,8 +261,30 @@ def embedded(data: ReportData) -> dict[str, Any] | None:
     shown = data.inspector()
     content = {f"map-{i}": each.packed.data for i, each in enumerate(shown.maps) if each.packed is not None}
     content["inspector-sample"] = _sample_bytes(shown.sample)
+    sample = shown.sample
+    facts = {
+        "shape": list(data.shape),
+        "noun": data.noun,
+        "channels": list(data.channel_names),
+        "samples": "samples" if data.shape[0] == 1 else "frames",
+        "statusWords": {str(int(bit)): text for bit, text in MEANINGS.items()},
+        "failedMask": int(FAILED),
+        "model": data.run.get("model", ""),
+        "command": shown.command,
+        "keptTo": shown.kept_to,
+        "colours": shades().tobytes().hex(),
+        "maps": [map_facts(entry) for entry in shown.maps],
+        "panel": list(PANEL_MAPS),
+        "sample": {
+            "n": int(sample.index.size),
+            "exact": list(sample.exact),
+            "deciding": sample.deciding is not None,
+            "masses": len(sample.masses),
+        },
+        "notable": [each._asdict() for each in sample.reasons],
+    }
     return {
-        "facts": json_for_html(_facts(data, shown)),
+        "facts": json_for_html(facts),
         "blobs": {name: Markup(_base64(each)) for name, each in content.items()},
         "script": Markup(text_of("inspector.js")),
     }
@@ -304,7 +314,8 @@ def served_page(page: str) -> str | None:
     if not found or 'id="inspector-app"' not in after:
         return None
     mark, served = '<meta name="color-scheme"', '<meta name="pchem-view" content="yes">'
-    return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{served}\n{mark}", 1)
+    here = escape("connect-src 'self'")
+    return f"{before}{here}{after}".replace(mark, f"{served}\n{mark}", 1)
 
 
 def json_for_html(content: Any) -> Markup:
@@ -313,32 +324,6 @@ def json_for_html(content: Any) -> Markup:
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
     return Markup(text)
-
-
-def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
-    """Return what the script must know beside the maps."""
-    sample = shown.sample
-    return {
-        "shape": list(data.shape),
-        "noun": data.noun,
-        "channels": list(data.channel_names),
-        "samples": "samples" if data.shape[0] == 1 else "frames",
-        "statusWords": {str(int(bit)): text for bit, text in MEANINGS.items()},
-        "failedMask": int(FAILED),
-        "model": data.run.get("model", ""),
-        "command": shown.command,
-        "keptTo": shown.kept_to,
-        "colours": shades().tobytes().hex(),
-        "maps": [map_facts(entry) for entry in shown.maps],
-        "panel": list(PANEL_MAPS),
-        "sample": {
-            "n": int(sample.index.size),
-            "exact": list(sample.exact),
-            "deciding": sample.deciding is not None,
-            "masses": len(sample.masses),
-        },
-        "notable": [each._asdict() for each in sample.reasons],
-    }
 
 
 def map_facts(entry: MapEntry) -> dict[str, Any]:
@@ -364,9 +349,7 @@ def map_facts(entry: MapEntry) -> dict[str, Any]:
 def packed_facts(packed: PackedMap) -> dict[str, Any]:
     """Return what the script must know to read a packed map."""
     found: dict[str, Any] = vars(packed.scale) | {"nOdd": packed.n_odd}
-    if packed.bars is not None:
-        found["bars"] = vars(packed.bars) | {"counts": packed.bars.counts.tolist()}
-    return found
+    return found if packed.bars is None else found | {"bars": packed.bars}
 
 
 def _sample_bytes(sample: PixelSample) -> bytes:

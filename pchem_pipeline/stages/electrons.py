@@ -25,9 +25,6 @@ from pchem_pipeline.stages.bands import BAND_BYTES, Band, tile_bands
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
 from pchem_pipeline.store.run_store import RunStore
 
-#: Frames and columns of a chunk; its rows are those of a tile.
-_CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
-
 
 def read_tables(store: RunStore, rows: slice) -> NumberTables:
     """Return the electron numbers of the codes that some rows have shown, the fitted H being the prior."""
@@ -54,11 +51,11 @@ def run(context: StageContext) -> None:
     source = open_source(context)
     n_frames, _, nx = source.shape
     rows_of_tile, columns_of_tile = context.tile
-    depth = max(1, min(_CHUNK_FRAMES, BAND_BYTES // (rows_of_tile * nx * 2)))
+    depth = max(1, min(256, BAND_BYTES // (rows_of_tile * nx * 2)))
     context.create(
         "electrons/electron_number",
         lengths={"frame": n_frames},
-        chunks={"frame": depth, "x": max(_CHUNK_COLUMNS, columns_of_tile)},
+        chunks={"frame": depth, "x": max(128, columns_of_tile)},
         # not missing_value: xarray would turn the integers into floats
         no_number=NO_NUMBER,
         largest_number=LARGEST_NUMBER,

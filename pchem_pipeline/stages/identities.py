@@ -13,6 +13,7 @@ from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.run.input import known_identity
 from pchem_pipeline.run.model_versions import model_versions, with_digest
 from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.stages.samples import exposure_axis, sample_facts
 from pchem_pipeline.store.run_store import RunStore
 
@@ -107,8 +108,8 @@ def other_samples(context: StageContext) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in methods_settings(context).with_runs:
         try:
-            record = RunStore.open(context.base_dir / name).records.read("histogram")
-        except StoreError:
+            record = RunStore.open(find_run(context.base_dir / name).store).records.read("histogram")
+        except (ConfigError, StoreError):
             record = None
         found[name] = None if record is None else record.fingerprint
     given = _chosen(context)

@@ -35,11 +35,6 @@ _CHUNK = (256, 128, 128)
 _MANY_FILES = 1500
 #: bytes of frames that a worker holds at once
 _UNIT_BYTES = 128 << 20
-#: bytes in the store for each pixel: histograms, fit and maps; for each byte of the summaries along time
-_STORED_PIXEL, _STORED_SERIES = 420, 0.3
-#: the copied frames are so much smaller than the frames
-_COPY_RATIO = 1.77
-
 #: Frames and rows, first and end each: whole chunks of ``frames/dn``.
 _Copied = tuple[int, int, int, int]
 
@@ -126,15 +121,15 @@ def create_frames(context: StageContext, reader: FrameSequence) -> None:
 def disk_words(config: RunConfig, frames: FrameSequence) -> str:
     """Return where the frames are to be, and about how much disk the store takes."""
     n, ny, nx = frames.shape
-    held: float = _STORED_PIXEL * ny * nx
+    held: float = 420 * ny * nx  # histograms, fit and maps
     if config.histogram.summaries:
         blocks = n / config.histogram.block_length(n)
         series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
-        held += _STORED_SERIES * series
+        held += 0.3 * series  # as they compress
     how = "stay in"
     if config.input.mode == "copy":
         how = "are copied from"
-        held += n * ny * nx * frames.dtype.itemsize / _COPY_RATIO
+        held += n * ny * nx * frames.dtype.itemsize / 1.77  # as they compress
     return (
         f"frames {how} their files ({sum(map(file_size, frames.paths)) / 1e9:.2g} GB); "
         f"the store will hold about {held / 1e9:.2g} GB"
@@ -175,7 +170,6 @@ def copy_units(
 
 
 def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None:
-    """Read the frames of a unit and write them into the store, a row of chunks at a time."""
     rows, (t0, t1, y0, y1) = store.array("frames/dn").chunks[1], unit.content
     for y in range(y0, y1, rows):
         end = min(y + rows, y1)

@@ -113,30 +113,26 @@ def _arrays(
     line: _Line | None,
     n_frames: int | None,
 ) -> dict[str, NDArray[Any]]:
-    """Return all that the stage makes of the fit of some pixels, by path."""
     maps = maps_tile(store.at(region, "fit"), integration_time, rate, n_frames)
     found = {f"maps/{name}": values for name, values in maps.items()}
-    return found if line is None else found | _line_arrays(store.at(region, "samples"), line)
+    if line is None:
+        return found
+    samples, (names, x) = store.at(region, "samples"), line
+    exposure, covariance = samples["quanta_exposure"], samples["covariance"]
+    n, *shape = exposure.shape
+    of_line = line_maps(exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), x, names)
+    return found | {
+        f"{group}/{name}": np.ascontiguousarray(values.T).reshape(*values.shape[1:], *shape)
+        for group, arrays in zip(("maps", "samples"), of_line, strict=True)
+        for name, values in arrays.items()
+    }
 
 
 def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDArray[Any]]]) -> None:
     store.at(tile.region).update(arrays(store, tile.region))
 
 
-def _line_arrays(samples: Arrays, line: _Line) -> dict[str, NDArray[Any]]:
-    """Return the results of a line through the exposures of each pixel, by path."""
-    exposure, covariance, (names, x) = samples["quanta_exposure"], samples["covariance"], line
-    n, *shape = exposure.shape
-    maps, left = line_maps(exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), x, names)
-    return {
-        f"{group}/{name}": np.ascontiguousarray(values.T).reshape(*values.shape[1:], *shape)
-        for group, found in (("maps", maps), ("samples", left))
-        for name, values in found.items()
-    }
-
-
 def _summarise(context: StageContext, names: list[str]) -> None:
-    """Keep the summaries of the maps in the attributes of their group."""
     settings = context.config.maps
     status = context.store.read("fit/fit_status")
     found: dict[str, Any] = {}

@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
-from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
+from pchem_pipeline.base.errors import InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import StudyPoint, compare, study_point
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
-from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Named, StageContext
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.identities import methods_settings
+from pchem_pipeline.stages.samples import find_runs, open_sample, same_sensor
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
 
@@ -44,51 +45,17 @@ def read_methods(store: RunStore) -> dict[str, Any] | None:
     return result
 
 
-def open_other_runs(store: RunStore, base_dir: Path, names: tuple[str, ...]) -> list[RunStore]:
-    """Return the stores of other runs, as named in ``methods.with_runs`` below a folder.
+def open_other_runs(here: Target, names: Sequence[str]) -> list[RunStore]:
+    """Return the stores of other runs, as named in ``methods.with_runs`` of a run.
 
     Raises:
-        ConfigError: a run is listed twice, or is the run itself.
-        InputError: a run is of other pixels or another ADC, or holds the same frames as another.
+        ConfigError: a run is listed twice, is the run itself, or has other pixels or the same frames.
         StoreError: a run is missing or has no histograms.
     """
-    here = SensorInfo.read(store)
-    seen: dict[str, str] = {here.identity.get("digest", ""): store.path.name}
-    paths = {store.path.resolve()}
-    found = []
-    for name in names:
-        path, resolved = base_dir / name, (base_dir / name).resolve()
-        if resolved in paths:
-            what = "is the run itself" if resolved == store.path.resolve() else "is listed twice"
-            raise ConfigError(f"methods.with_runs: {name} {what}; give each sample once")
-        paths.add(resolved)
-        other = RunStore.open(path)
-        if not other.has("histogram/counts"):
-            raise StoreError(f"{path} has no histograms yet; run: pchem histogram {quoted(path)}")
-        there = SensorInfo.read(other)
-        _same_pixels(here, there, name)
-        digest = there.identity.get("digest", "")
-        if digest and digest in seen:
-            raise InputError(
-                f"{name} has the same frames as {seen[digest]}; give a sample at another exposure"
-            )
-        seen[digest] = name
-        found.append(other)
-    return found
-
-
-def _same_pixels(here: SensorInfo, there: SensorInfo, name: str) -> None:
-    """Refuse samples of other sensors."""
-    if here.shape != there.shape:
-        raise InputError(
-            f"{name} has {there.ny} x {there.nx} pixels, this run {here.ny} x {here.nx}; samples must have "
-            "the same pixels (see input.roi)"
-        )
-    if None not in (here.bit_depth, there.bit_depth) and here.bit_depth != there.bit_depth:
-        raise InputError(
-            f"{name} has {there.bit_depth} bits, this run {here.bit_depth}; samples must be from the same "
-            "sensor"
-        )
+    runs = find_runs(names, here.base_dir, "methods.with_runs", here)
+    samples = [open_sample(run, where) for run, where in zip(runs, ("this run", *names), strict=True)]
+    same_sensor(samples)
+    return [each.store for each in samples[1:]]
 
 
 def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> IntArray:
@@ -105,8 +72,8 @@ def run(context: StageContext) -> None:
     """Write ``methods.json`` and the estimates of every method.
 
     Raises:
-        ConfigError: a run is listed twice.
-        InputError: another run is of other pixels, or the run is one of several samples.
+        ConfigError: another run is of other pixels, or is listed twice.
+        InputError: the run is one of several samples.
         StoreError: a run is missing or the store cannot be written.
     """
     if context.sensor.samples:
@@ -115,7 +82,8 @@ def run(context: StageContext) -> None:
             "sample: pchem methods RUN --with OTHER"
         )
     settings = methods_settings(context)
-    others = open_other_runs(context.store, context.base_dir, settings.with_runs)
+    here = Target(context.config, context.base_dir, context.store.path)
+    others = open_other_runs(here, settings.with_runs)
     units = [_Unit("run", None), *_study_units(context, settings)]
     stores = [context.store.path, *(other.path for other in others)]
     task = functools.partial(_do, stores=stores, settings=settings, adc_limits=context.sensor.adc_limits)
@@ -185,7 +153,6 @@ def _do(
 
 
 def _sample(store: RunStore, y: IntArray, x: IntArray) -> Sample:
-    """Read the histograms of some pixels."""
     counts, origin = (store.read_pixels(f"histogram/{name}", y, x) for name in ("counts", "origin"))
     return Sample(counts, origin.astype(np.int64))
 
@@ -205,7 +172,6 @@ def _reference(store: RunStore, y: IntArray, x: IntArray) -> tuple[FloatArray, s
 def _sample_words(
     names: Sequence[str], samples: Sequence[Sample], reference: FloatArray
 ) -> list[dict[str, Any]]:
-    """Describe the samples: name, frames, and the median exposure that the reference gives them."""
     found = []
     for name, sample in zip(names, samples, strict=True):
         moments = sample.moments()
@@ -222,7 +188,6 @@ def _sample_words(
 
 
 def _remarks(samples: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say what the comparison lacks."""
     if len(samples) == 1:
         return [
             "one sample: methods that need dark frames or a series are omitted; add runs of the same pixels "

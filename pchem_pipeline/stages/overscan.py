@@ -13,17 +13,14 @@ from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.overscan import Overscan
 
-#: Frames that are read, evenly spread: their mean adds a thousandth to the variance of a row's offset.
-_MOST_FRAMES = 1024
 _FACTS = ("n_frames", "frame_variance", "row_variance")
 
 
-def overscan_samples(
-    frames: FrameSequence, where: BoolArray, most: int = _MOST_FRAMES
-) -> Iterator[FloatArray]:
+def overscan_samples(frames: FrameSequence, where: BoolArray, most: int = 1024) -> Iterator[FloatArray]:
     """Yield the samples of some pixels of the overscan in frames spread over all, DN, shape (pixel,).
 
-    Frames of which the first row lies far from that of the others, such as empty ones, are left out.
+    The mean of 1024 frames adds a thousandth to the variance of a row's offset. Frames of which the first row
+    lies far from that of the others, such as empty ones, are left out.
     """
     source, (y, x) = frames.with_overscan(), np.nonzero(where)
     first, end = int(y[0]), int(y[-1]) + 1

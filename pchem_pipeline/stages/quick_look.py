@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.report.stored import StoredRun
 
 #: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
-_MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22
+_MOST_SUMS = 1 << 22
 #: Pixels whose codes are looked at, in so many pieces of the sensor, and the fewest that say anything.
 _PIXELS, _PIECES, _FEWEST = 1024, 8, 16
 
@@ -85,11 +85,11 @@ def read_sums(store: RunStore) -> StackSums | None:
     usable = np.flatnonzero(known > 1)
     if not usable.size:
         return None  # a single frame in each block
-    frames = min(_MOST_LINE_SUMS // ny, mean.size)
-    most = min(_MOST_BLOCK_SUMS // (ny * nx), frames // int(lengths[0]) if frames < mean.size else n_blocks)
+    frames = min(_MOST_SUMS // ny, mean.size)
+    most = min(_MOST_SUMS // (ny * nx), frames // int(lengths[0]) if frames < mean.size else n_blocks)
     chosen = usable[_spread(usable.size, most)]
     groups = store.array("summary/column_sum").shape[1]
-    some = _spread(chosen.size, _MOST_LINE_SUMS // (groups * nx * int(lengths[0])))
+    some = _spread(chosen.size, _MOST_SUMS // (groups * nx * int(lengths[0])))
 
     def lines(name: str, of: IntArray) -> IntArray:
         first, end = starts[of], (starts + lengths)[of]

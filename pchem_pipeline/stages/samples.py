@@ -49,23 +49,25 @@ class OpenSample:
         return [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
 
 
-def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
-    """Return the runs of the samples.
+def find_runs(names: Sequence[Path | str], base_dir: Path, setting: str, *first: Target) -> list[Target]:
+    """Return the ``first`` runs and those of a setting, below a folder.
 
     Raises:
-        ConfigError: two samples are one run, or a run cannot be found.
+        ConfigError: two are one run, or a run cannot be found.
     """
-    targets, seen = [], dict[str, str]()
-    for sample in config.input.samples:
-        target = find_run(base_dir / sample.run)
-        place = str(target.store.resolve())
-        if place in seen:
+    targets = list(first)
+    for target, name in ((find_run(base_dir / name), name) for name in names):
+        if target.store.resolve() in [each.store.resolve() for each in targets]:
             raise ConfigError(
-                f"input.samples: {sample.run} is the run of {seen[place]} again; list each run once"
+                f"{setting}: {name} is the run of {target.store.name} again; list each run once"
             )
-        seen[place] = str(sample.run)
         targets.append(target)
     return targets
+
+
+def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
+    """Return the runs of the samples; see `find_runs`."""
+    return find_runs([sample.run for sample in config.input.samples], base_dir, "input.samples")
 
 
 def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
@@ -75,17 +77,23 @@ def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
         ConfigError: two samples are one run, or a run cannot be found.
         StoreError: a run has no histograms.
     """
-    found = []
-    for given, target in zip(config.input.samples, sample_targets(config, base_dir), strict=True):
-        store = RunStore.open(target.store)
-        record = store.records.read("histogram")
-        where = f"sample {given.run}"
-        if record is None or not store.has("histogram/counts"):
-            raise StoreError(
-                f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
-            )
-        found.append(OpenSample(where, target, store, target.sensor(store), record.fingerprint))
-    return found
+    samples = zip(config.input.samples, sample_targets(config, base_dir), strict=True)
+    return [open_sample(target, f"sample {given.run}") for given, target in samples]
+
+
+def open_sample(target: Target, where: str) -> OpenSample:
+    """Return a run with its histograms.
+
+    Raises:
+        StoreError: it has none.
+    """
+    store = RunStore.open(target.store)
+    record = store.records.read("histogram")
+    if record is None or not store.has("histogram/counts"):
+        raise StoreError(
+            f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
+        )
+    return OpenSample(where, target, store, target.sensor(store), record.fingerprint)
 
 
 def check_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
@@ -97,33 +105,37 @@ def check_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
         StoreError: a run has no histograms.
     """
     samples = open_samples(config, base_dir)
-    for i in range(1, len(samples)):
-        _same_sensor(samples[:i], samples[i])
+    same_sensor(samples)
     _check_increasing(config.input, samples)
     return samples
 
 
-def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
-    """Compare a sample with those before it."""
-    first = others[0]
-    here, there = mine.sensor, first.sensor
-    sizes = [f"{each.ny} x {each.nx}" for each in (here, there)]
-    regions = [str(each.target.config.input.roi) for each in (mine, first)]
-    same_region = "all samples must show the same region of one sensor"
-    same_sensor = "all samples must come from one sensor with the same settings"
-    for facts, words, rule in (
-        (sizes, "has {} pixels, {} {}", same_region),
-        ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", same_sensor),
-        (regions, "is cropped to {} (input.roi), {} to {}", same_region),
-    ):
-        if None not in facts and facts[0] != facts[1]:
-            found = words.format(facts[0], first.where, facts[1])
-            raise ConfigError(f"{mine.where} {found}; {rule}")
-    if found := unlike(here.camera, there.camera, first.where):
-        raise ConfigError(f"{mine.where}: {found}; {same_sensor}")
-    for other in others:
-        if mine.shares_frames(other):
-            raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
+def same_sensor(samples: Sequence[OpenSample]) -> None:
+    """Check that samples have different frames of the same pixels.
+
+    Raises:
+        ConfigError: they have not.
+    """
+    region = "all samples must show the same region of one sensor"
+    sensor = "all samples must come from one sensor with the same settings"
+    first = samples[0]
+    for i, mine in enumerate(samples[1:], 1):
+        here, there = mine.sensor, first.sensor
+        sizes = [f"{each.ny} x {each.nx}" for each in (here, there)]
+        regions = [str(each.target.config.input.roi) for each in (mine, first)]
+        for facts, words, rule in (
+            (sizes, "has {} pixels, {} {}", region),
+            ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", sensor),
+            (regions, "is cropped to {} (input.roi), {} to {}", region),
+        ):
+            if None not in facts and facts[0] != facts[1]:
+                found = words.format(facts[0], first.where, facts[1])
+                raise ConfigError(f"{mine.where} {found}; {rule}")
+        if found := unlike(here.camera, there.camera, first.where):
+            raise ConfigError(f"{mine.where}: {found}; {sensor}")
+        for other in samples[:i]:
+            if mine.shares_frames(other):
+                raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
 
 
 def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> FloatArray | None:
@@ -183,7 +195,6 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
 
 
 def _exposures(settings: InputSettings, samples: Sequence[OpenSample]) -> tuple[Sample, ...]:
-    """Return what is known of the exposure of each sample."""
     return tuple(
         Sample(
             found.store.path.name,

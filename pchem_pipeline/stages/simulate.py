@@ -69,18 +69,26 @@ def run(context: StageContext) -> None:
     names = np.array([name for name, _, _ in files])
     facts = {"files": names, "integration_time": settings.integration_time, "seed": settings.seed}
     write_npz(folder / TRUTH_FILE, truth.arrays() | facts)
-    electron_units = _electron_units(settings)
+    n = min(settings.truth_frames, settings.n_frames)
+    step = max(1, min(n, _CHUNK // (4 * math.prod(settings.shape))))
+    electron_units: list[_Unit] = [
+        Named(f"electrons-{start}-{end}", [(None, start, end)]) for start, end in equal_rows(n, step)
+    ]
     if electron_units:
-        step, (rows, columns) = electron_units[0].content[-1][2], settings.shape
+        rows, columns = settings.shape
         band = min(rows, ROW_GROUP)
         context.create(
             "truth/electron_number",
-            lengths={"frame": electron_units[-1].content[-1][2], "y": rows, "x": columns},
+            lengths={"frame": n, "y": rows, "x": columns},
             # the ensemble reads them by bands
             chunks={"frame": step, "y": band},
             shards=(step, band * math.ceil(rows / band), columns),
         )
-    frame_units, workers = _frame_units(files), context.executor.workers
+    # some hundred units at most, so that markers cost nothing
+    together = math.ceil(len(files) / _MOST_UNITS)
+    groups = [files[i : i + together] for i in range(0, len(files), together)]
+    frame_units: list[_Unit] = [Named(f"frames-{group[0][1]}-{group[-1][2]}", group) for group in groups]
+    workers = context.executor.workers
     alone = len(frame_units) == 1
     task = functools.partial(_do, settings=settings, folder=folder, workers=workers, alone=alone)
     # frames are made whole: tiles and regions mean the sensor that is read
@@ -194,21 +202,7 @@ def _files(settings: SimulateSettings) -> list[tuple[str, int, int]]:
     return [(f"frames_{i:0{width}d}{suffix}", *part) for i, part in enumerate(parts, 1)]
 
 
-def _frame_units(files: list[tuple[str, int, int]]) -> list[_Unit]:
-    """Share the files out: some hundred units at most, so that markers cost nothing."""
-    step = math.ceil(len(files) / _MOST_UNITS)
-    groups = [files[i : i + step] for i in range(0, len(files), step)]
-    return [Named(f"frames-{group[0][1]}-{group[-1][2]}", group) for group in groups]
-
-
-def _electron_units(settings: SimulateSettings) -> list[_Unit]:
-    n = min(settings.truth_frames, settings.n_frames)
-    step = max(1, min(n, _CHUNK // (4 * math.prod(settings.shape))))
-    return [Named(f"electrons-{start}-{end}", [(None, start, end)]) for start, end in equal_rows(n, step)]
-
-
 def _prepare(folder: Path, settings: SimulateSettings) -> None:
-    """Remove the files of an earlier simulation, and nothing else; refuse a disk that is too small."""
     needed = settings.n_frames * math.prod(settings.shape) * dn_dtype(settings.bit_depth).itemsize
     with in_storage(folder):
         if folder.exists() and any(folder.iterdir()):

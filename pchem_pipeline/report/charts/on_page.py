@@ -16,7 +16,6 @@ from pchem_pipeline.report.charts.chart import (
     Image,
     Line,
     Mark,
-    Panel,
     Points,
     Stack,
     Steps,
@@ -55,7 +54,13 @@ def _stack(stack: Stack) -> dict[str, Any]:
         "title": without_formulas(stack.title),
         "height": stack.height_mm,
         "x": _axis(stack.x, ends),
-        "panels": [_panel(panel, stack.x, ends) for panel in stack.panels],
+        "panels": [
+            {"height": panel.height, "y": _axis(panel.y, up)}
+            | ({"note": without_formulas(panel.note), "corner": panel.corner} if panel.note else {})
+            | {"marks": [_mark(mark, (ends, stack.x.log), (up, panel.y.log)) for mark in panel.marks]}
+            for panel in stack.panels
+            for up in [y_window(panel)]
+        ],
     }
 
 
@@ -68,15 +73,6 @@ def _axis(axis: Axis, ends: Ends) -> dict[str, Any]:
         "ends": rounded(np.asarray(ends), ends, axis.log),
         **{name: value for name, value in rest.items() if value},
     }
-
-
-def _panel(panel: Panel, x: Axis, across: Ends) -> dict[str, Any]:
-    up = y_window(panel)
-    found: dict[str, Any] = {"height": panel.height, "y": _axis(panel.y, up)}
-    if panel.note:
-        found |= {"note": without_formulas(panel.note), "corner": panel.corner}
-    found["marks"] = [_mark(mark, (across, x.log), (up, panel.y.log)) for mark in panel.marks]
-    return found
 
 
 def _places(values: Values, ends: Ends, log: bool) -> list[float | None] | dict[str, float]:

@@ -119,7 +119,6 @@ class Drawing(MatplotlibFigure):
             super().savefig(*args, **kwargs)
 
     def _repr_png_(self) -> bytes:
-        """Return the figure as a notebook shows it."""
         return drawing_bytes(self, "png", dpi=150)
 
 
@@ -212,14 +211,9 @@ def small_png(png: bytes) -> bytes:
     return buffer.getvalue()
 
 
-#: Height of a further line of a title or of a legend, mm; letters of a title on a millimetre; room beside a
-#: panel, left of its title, mm.
-_LINE_MM, _LETTERS, _BESIDE_MM = 3.5, 0.66, 12.0
-#: Rows or columns of a map up to which a vector file keeps each pixel.
-_MOST_KEPT = 800
+#: Height of a further line of a title or of a legend, mm; letters of a title on a millimetre.
+_LINE_MM, _LETTERS = 3.5, 0.66
 _DASHES: dict[Dash, Any] = {"-...": (0, (5, 1, 1, 1, 1, 1)), "..": (0, (1, 1))}
-#: Points beyond which they are an image in a vector file.
-_MOST_POINTS = 1000
 #: What a legend shows of a mark.
 Handle = Any
 _MATH = re.compile(r"\$[^$]*\$")
@@ -269,7 +263,7 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
     columns = len(chart.widths) if look.wide else 1
     width = look.width_mm / columns
     stacks = [
-        replace(stack, title=_broken(stack.title, width - _BESIDE_MM))
+        replace(stack, title=_broken(stack.title, width - 12.0))  # 12 mm are left of the panel
         for stack in chart.stacks
         if look.wide or not stack.wide
     ]
@@ -356,7 +350,6 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, width_mm: fl
 
 
 def _note(axes: Axes, text: str, corner: str) -> None:
-    """Write a small note into a corner of the axes."""
     vertical, horizontal = corner.split()
     x, va = 0.985 if horizontal == "right" else 0.015, "top" if vertical == "upper" else "bottom"
     y = 0.975 if vertical == "upper" else 0.03
@@ -370,7 +363,8 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
     one, set_scale = getattr(axes, f"{name}axis"), getattr(axes, f"set_{name}scale")
     if axis.log:
         set_scale("log")
-        one.set_major_formatter(_decade)  # characters: a formula takes ten times as long
+        # characters: a formula takes ten times as long
+        one.set_major_formatter(lambda place, _: power_of_ten(round(np.log10(place))) or "1")
     elif axis.linear_to:
         set_scale("symlog", linthresh=axis.linear_to, linscale=1.5)
     if axis.ticks:
@@ -383,10 +377,6 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
         one.get_major_formatter().set_useOffset(False)
         if name == "x":
             one.get_major_locator().set_params(nbins=most)
-
-
-def _decade(place: float, _: object) -> str:
-    return power_of_ten(round(np.log10(place))) or "1"
 
 
 def _end(axes: Axes, name: str, axis: Axis) -> None:
@@ -431,7 +421,7 @@ def _draw_mark(axes: Axes, mark: Mark, look: Look, order: int) -> Handle:
             return axes.vlines(mark.x, 0.0, mark.y, **options, **style)
         case Points():
             # many points would make a vector file large
-            style |= {"linestyle": "none", "marker": mark.mark, "rasterized": mark.y.size > _MOST_POINTS}
+            style |= {"linestyle": "none", "marker": mark.mark, "rasterized": mark.y.size > 1000}
             if mark.face:
                 style |= {"markerfacecolor": colour_of(mark.face), "markeredgewidth": 0.8}
             if mark.error is None:
@@ -472,7 +462,7 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     low, high = mark.ends
     axes.set_facecolor(LIGHT.no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
-    kept = "none" if max(mark.values.shape) <= _MOST_KEPT else "nearest"
+    kept = "none" if max(mark.values.shape) <= 800 else "nearest"
     image = axes.imshow(
         mark.levels(values).astype(np.float32), colours, vmin=low, vmax=high, origin="upper",
         interpolation=kept, aspect=axes.get_aspect(), extent=(*x, *y[::-1]),

@@ -37,6 +37,7 @@ from pchem_pipeline.report.charts.chart import (
     Stack,
 )
 from pchem_pipeline.report.comparison import HistoryRow, Pair, RunFacts
+from pchem_pipeline.report.data import MAP_NAMES
 from pchem_pipeline.report.figures.ensemble import HALVES
 from pchem_pipeline.report.figures.figure import DataTable, Figure, pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
@@ -45,8 +46,6 @@ from pchem_pipeline.report.style.ranges import finite
 #: Hues and styles of the ensembles of runs.
 _HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")
 _LINES: tuple[Dash, ...] = ("-", "--", "-.", ":")
-#: Colours end at the 99 % quantile of the differences, at least here, standard errors.
-_LEAST = 4.0
 
 
 def difference_figures(pair: Pair) -> list[Figure]:
@@ -120,7 +119,7 @@ def difference_chart(z: FloatArray, n_changed: int, title: str, *, same_data: bo
     Beside this is N(0, 1), but for fits of the same frames, which have no sampling noise.
     """
     known = finite(z)
-    limit = _limit(known, _LEAST if not same_data else 0.0)
+    limit = _limit(known, 4.0 if not same_data else 0.0)
     # a power of ten in which the differences have few digits
     power = int(np.floor(np.log10(limit))) if limit < 0.01 else 0
     unit, label = 10.0**power, f"{power_of_ten(power)} standard errors".strip()
@@ -182,7 +181,6 @@ def _one_half(table: DataTable, unit: str, title: str) -> Stack:
 
 
 def _curve(run: RunFacts, axis: str, prefix: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the axis, the density and its standard error by counting."""
     x, density, counts = (
         np.asarray(run.ensemble[each], dtype=np.float64)
         for each in (axis, f"{prefix}density", f"{prefix}counts")
@@ -192,15 +190,10 @@ def _curve(run: RunFacts, axis: str, prefix: str) -> tuple[FloatArray, FloatArra
     return x, density, np.sqrt(np.maximum(counts, 0.0)) / (total * step)
 
 
-_SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
-#: Letters of the labels of all runs that an axis has room for, and ticks at most.
-_LETTERS, _MOST_TICKS = 48, 12
-
-
 def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
     """Return the medians of the maps of each run, by labels or dates; none for fewer than two runs."""
     parts = {"median": "median", "standard error": "median_stderr", "scatter": "scatter"}
-    shown = [name for name in _SHOWN if any(row[f"{name}_median"] for row in rows)]
+    shown = [name for name in ("quanta_exposure", *MAP_NAMES) if any(row[f"{name}_median"] for row in rows)]
     if len(rows) < 2 or not shown:
         return
     labelled = all(row["label"] != row["date"] for row in rows)
@@ -222,6 +215,18 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
             columns[f"{name} {words}"] = [float(row[f"{name}_{part}"] or "nan") for row in rows]
             units[f"{name} {words}"] = stored_unit(name)
     table = DataTable(columns, units)
+    order = np.argsort(at, kind="stable")
+    panels = []
+    for name in shown:
+        median, error, scatter = (np.array(columns[f"{name} {words}"])[order] for words in parts)
+        marks = (
+            Band(at[order], median - scatter, median + scatter, alpha=0.15, label="scatter of the pixels"),
+            Line(at[order], median),
+            Points(at[order], median, size=3.0, error=np.stack([error, error]), label="median"),
+        )
+        sign, _, unit = symbol(name)
+        panels.append(Panel(Axis(f"{sign} ({unit})"), marks))
+    x = Axis(axis, ticks=() if ordered else _labels(rows))
     words = "; ".join(
         f"{noun} from {short(medians[0])} to {short(medians[-1])} {unit}"
         for medians, (_, noun, unit) in ((columns[f"{name} median"], symbol(name)) for name in shown)
@@ -233,7 +238,7 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
         "Medians of the maps with their standard errors; band: scatter of the pixels.",
         f"From {rows[0]['label']} to {rows[-1]['label']}: {words}.",
         (table,),
-        _history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
+        Chart((Stack(tuple(panels), x, height_mm=26.0 * len(shown) + 10.0),)),
         PAGE_MM,
     )
 
@@ -249,29 +254,7 @@ def _place(row: HistoryRow, labelled: bool) -> float:
 def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
     """Return a tick for each run in its order, by its label where there is room, else by its number."""
     texts = [row["label"] for row in rows]
-    if sum(map(len, texts)) > _LETTERS:
+    if sum(map(len, texts)) > 48:  # an axis has no room for them
         texts = [str(i + 1) for i in range(len(rows))]
-    every = -(-len(rows) // _MOST_TICKS)
+    every = -(-len(rows) // 12)
     return tuple((float(i), texts[i]) for i in range(0, len(rows), every))
-
-
-def _history_chart(
-    table: DataTable, names: tuple[str, ...], axis: str, ticks: tuple[tuple[float, str], ...] = ()
-) -> Chart:
-    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels."""
-    order = np.argsort(table[axis], kind="stable")
-    at = table[axis].astype(np.float64)[order]
-    panels = []
-    for name in names:
-        median, error, scatter = (
-            table[f"{name} {part}"].astype(np.float64)[order]
-            for part in ("median", "standard error", "scatter")
-        )
-        marks = (
-            Band(at, median - scatter, median + scatter, alpha=0.15, label="scatter of the pixels"),
-            Line(at, median),
-            Points(at, median, size=3.0, error=np.stack([error, error]), label="median"),
-        )
-        sign, _, unit = symbol(name)
-        panels.append(Panel(Axis(f"{sign} ({unit})"), marks))
-    return Chart((Stack(tuple(panels), Axis(axis, ticks=ticks), height_mm=26.0 * len(names) + 10.0),))

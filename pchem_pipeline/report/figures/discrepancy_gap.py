@@ -55,6 +55,13 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
         for bar in bars
     ]
+    names, unit = ("model", *GapBar._fields[1:]), "1e-6 nats/sample"
+    columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
+    columns["floor"] = [MICRO * floor] * len(bars)
+    tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), unit))]
+    if parts:
+        shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
+        tables.append(DataTable(shares, dict.fromkeys(("before", "after"), unit), "families"))
     yield Figure(
         "discrepancy_gap",
         "shown",
@@ -63,7 +70,7 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "with the next best effect instead, fitted in the same way. Open triangles at the edge are gaps "
         "below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {'; '.join(words)}; floor {micronats(floor)}.",
-        _gap_tables(bars, parts, MICRO * floor),
+        tuple(tables),
         Chart((rows, _family_rows(parts, ends)), (1.0, 1.0), (2, 2)) if parts else Chart((rows,)),
         PAGE_MM,
     )
@@ -76,11 +83,24 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         return
     names = ("statistic", "sentence", "before", "after")
     columns = {name: [getattr(row, name) for row in rows] for name in names}
-    words = []
-    for row in rows[:6]:
-        after = f", after {row.after:+.1f}" if math.isfinite(row.after) else ""
-        before = f"{row.before:+.1f}" if math.isfinite(row.before) else "not known"
-        words.append(f"{row.sentence or row.statistic}: before {before}{after}")
+    words = [
+        f"{pull.sentence or pull.statistic}: before "
+        + (f"{pull.before:+.1f}" if math.isfinite(pull.before) else "not known")
+        + (f", after {pull.after:+.1f}" if math.isfinite(pull.after) else "")
+        for pull in rows[:6]
+    ]
+    marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
+    places = np.arange(len(rows))
+    values = {role: np.array(columns[role]) for role in ("before", "after")}
+    for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
+        marks += _bar_line(row, before, after, "bars", 1.4)
+    for role, label in (("before", "plain model"), ("after", "with effects")):
+        known = np.isfinite(values[role])
+        if known.any():
+            colour, shape = _ROLES[role]
+            marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=label))
+    reach = float(np.nanmax(np.abs([*values.values()]), initial=6.0))
+    x = pull_axis("deviation (sigma)", 1.4 * reach)
     yield Figure(
         "discrepancy_pulls",
         "shown",
@@ -89,21 +109,9 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Gray: 2 sigma. Sampling noise makes the largest of some hundred 3 sigma, counts of few pixels more.",
         f"In sigma. {'; '.join(words).replace('-', '−')}.",
         (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
-        _pulls_chart(rows),
+        Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2)),
         PAGE_MM,
     )
-
-
-def _gap_tables(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tuple[DataTable, ...]:
-    """Return the gap of each model, with its interval and the floor, and by family of statistics."""
-    names, unit = ("model", *GapBar._fields[1:]), "1e-6 nats/sample"
-    columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
-    columns["floor"] = [floor] * len(bars)
-    whole = DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), unit))
-    if not parts:
-        return (whole,)
-    shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
-    return whole, DataTable(shares, dict.fromkeys(("before", "after"), unit), "families")
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
@@ -198,7 +206,6 @@ def _limits(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tu
 
 
 def _gap_axis(ends: tuple[float, float]) -> tuple[Axis, list[Mark]]:
-    """Return the axis of gaps, and a line at each power of ten."""
     powers = range(math.ceil(math.log10(ends[0])) + 1, math.ceil(math.log10(ends[1])))
     grid: list[Mark] = [Level(10.0**power, "x", colour="grid", width=0.5) for power in powers]
     return Axis("gap (micronats per sample)", *ends, log=True), grid
@@ -244,20 +251,3 @@ def _point(value: float, row: int, left: float, role: str, label: str = "") -> P
     if value > left:
         return Points(np.array([value]), y, shape, 5.0, colour=colour, label=label)
     return Points(np.array([left * 1.12]), y, "<", 5.0, face="paper", colour=colour)
-
-
-def _pulls_chart(rows: Sequence[Pull]) -> Chart:
-    """Return the largest pulls before and after, in sigma."""
-    marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
-    places = np.arange(len(rows))
-    values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}
-    for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
-        marks += _bar_line(row, before, after, "bars", 1.4)
-    for role, words in (("before", "plain model"), ("after", "with effects")):
-        known = np.isfinite(values[role])
-        if known.any():
-            colour, shape = _ROLES[role]
-            marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
-    reach = float(np.nanmax(np.abs([*values.values()]), initial=6.0))
-    x = pull_axis("deviation (sigma)", 1.4 * reach)
-    return Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))

@@ -48,8 +48,8 @@ from pchem_pipeline.report.figures.figure import (
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
 
-#: Colours end at least, and at most, at so many standard deviations.
-_LEAST, _MOST = 4.0, 12.0
+#: Colours end at least at so many standard deviations.
+_LEAST = 4.0
 #: Pixels that stand out are counted, and ringed if they are no more.
 _MOST_RINGS = 60
 
@@ -86,13 +86,18 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         return
     origin = data.found.examined.origin
     flagged = [pixel for place in data.found.where for pixel in place.pixels]
-    words = [
-        f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
-        f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
-        + (f", mainly in {each.region.describe()}" if each.region is not None else "")
-        for each in maps
-        for known in [finite(each.z)]
-    ]
+    words, shown, below = [], [], []
+    for each in maps:
+        known, inside, outliers = finite(each.z), _inside(each, origin), count(each.outliers, "pixel")
+        words.append(
+            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
+            f"(expected 0 and 1), {outliers} beyond 5"
+            + (f", mainly in {each.region.describe()}" if each.region is not None else "")
+        )
+        shown.append(_map_stack(each, inside, flagged, origin))
+        edge = float(np.clip(np.abs(known).max(), 5.0, 15.0))
+        part = None if inside is None else each.z[inside]
+        below.append(pull_stack(known, edge, "standard deviations", f"{outliers} beyond ±5", part=part))
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
     yield Figure(
@@ -105,7 +110,7 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "pixels, long tails an effect in few; these are ringed in the map.",
         "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
         (table,),
-        _sensor_chart(maps, flagged, origin),
+        Chart((*shown, *below), (1.0,) * len(maps)),
         PAGE_MM,
     )
 
@@ -115,11 +120,20 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     tables: list[DataTable] = []
     words: list[str] = []
     stacks: list[Stack] = []
-    for line, first in zip(LINE_WORDS, data.found.examined.origin, strict=True):
+    for line, axis, first in zip(LINE_WORDS, "yx", data.found.examined.origin, strict=True):
         rms, image = (np.asarray(data.arrays.get(f"{line}_{name}", ())) for name in ("rms", "image"))
         if rms.size:
-            tables += _line_tables(line, rms, image, first)
-            words.append(_line_text(line, rms))
+            columns = {axis: first + np.arange(rms.shape[1])}
+            columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
+            tables.append(DataTable(columns, {axis: "pixel"}, f"{line}_scatter"))
+            if image.size:
+                means = dict(zip(CHANNELS, image, strict=False))
+                units = dict.fromkeys(means, "standard deviations")
+                index = ("frame", f"{axis} (pixel)")
+                tables.append(DataTable(means, units, f"{line}_means", index, (0, first)))
+            channels = zip(CHANNELS, map(finite, rms), strict=False)
+            numbers = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
+            words.append(f"{LINE_WORDS[line]}: {' and '.join(numbers) or 'not known'}")
             for channel in ("readout", "charge"):
                 shown = image[CHANNELS.index(channel)] if image.size else None
                 stacks.append(_frames(shown, line, channel, first))
@@ -138,24 +152,6 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
         Chart(tuple(stacks), (1.0, 1.0, 1.0)),
         PAGE_MM,
     )
-
-
-def _line_tables(line: str, rms: NDArray[Any], image: NDArray[Any], first: int) -> list[DataTable]:
-    """Return the scatter of each row or column, and their means in the first frames."""
-    axis = "y" if line == "row" else "x"
-    columns = {axis: first + np.arange(rms.shape[1])}
-    columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
-    scatter = DataTable(columns, {axis: "pixel"}, f"{line}_scatter")
-    means = dict(zip(CHANNELS, image, strict=False))
-    units = dict.fromkeys(means, "standard deviations")
-    shown = DataTable(means, units, f"{line}_means", ("frame", f"{axis} (pixel)"), (0, first))
-    return [scatter, shown] if image.size else [scatter]
-
-
-def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
-    channels = zip(CHANNELS, map(finite, rms), strict=False)
-    found = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
-    return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
 class PixelMap(NamedTuple):
@@ -227,26 +223,10 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None) -> Pixel
     return PixelMap(words, z, float(max(departures)), outliers, region)
 
 
-def _sensor_chart(
-    maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
-) -> Chart:
-    """Return maps of statistics of each pixel, and below their histograms with that under the model."""
-    shown, below = [], []
-    for each in maps:
-        inside = _inside(each, origin)
-        known = finite(each.z)
-        edge = float(np.clip(np.abs(known).max(), 5.0, 15.0))
-        part = None if inside is None else each.z[inside]
-        note = f"{count(each.outliers, 'pixel')} beyond ±5"
-        shown.append(_map_stack(each, inside, flagged, origin))
-        below.append(pull_stack(known, edge, "standard deviations", note, part=part))
-    return Chart((*shown, *below), (1.0,) * len(maps))
-
-
 def _map_stack(
     each: PixelMap, inside: BoolArray | None, flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
 ) -> Stack:
-    limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
+    limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, 12.0))
     beyond: BoolArray = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT
     rings = np.zeros_like(beyond)
     for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
@@ -273,7 +253,6 @@ def _inside(each: PixelMap, origin: tuple[int, int]) -> BoolArray | None:
 
 
 def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
-    """Return the edges of a set of pixels."""
     padded = np.pad(inside, 1)
     y, x = origin
     # each edge of a pixel that parts inside from outside is a line of its own, between gaps
@@ -289,7 +268,6 @@ def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
 
 
 def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> Stack:
-    """Return the means of the rows or columns of the first frames as a picture."""
     title, axis = f"{channel}: means of {LINE_WORDS[line]}", "y (pixel)" if line == "row" else "x (pixel)"
     x = Axis("frame (the first ones examined)", whole=True)
     panel = Panel(Axis(axis, whole=True), (), note="not kept")
@@ -318,8 +296,6 @@ def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
     return Stack((panel,), x, f"scatter of the {LINE_WORDS[line]}", height_mm=46.0)
 
 
-#: Number of stretches of the run over which frames are averaged.
-_STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
 _SCALES = {
     "charge": (100.0, "%", "charge: exposure (%)"),
@@ -364,7 +340,20 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of the frames along the run."""
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
         return
-    frames, stretches = _frame_tables(data.arrays)
+    arrays, units = data.arrays, dict[str, str]()
+    number = np.asarray(arrays["frame_number"], dtype=np.float64)
+    columns, means = {"frame": number}, dict[str, FloatArray]()
+    for channel, (scale, unit, _) in _SCALES.items():
+        if f"frame_{channel}" not in arrays:
+            continue
+        columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
+        centre, means[channel], n = trends(number, columns[channel])
+        path = arrays.get(f"frame_{channel}_model")
+        if path is not None and path.size:
+            columns[_model(channel)] = scale * np.asarray(path, dtype=np.float64)
+        units |= dict.fromkeys((channel, _model(channel)), unit)
+    frames = DataTable(columns, units)
+    stretches = DataTable({"frame": centre, "frames": n, **means}, units, "stretches")
     by_channel = data.arrays.get("frame_sd", np.full(2, np.nan)).tolist()
     sds = dict(zip((*CHANNELS, "noise"), (*by_channel, 1.0), strict=True))
     sds = {shown: sd for shown, sd in sds.items() if shown in frames}
@@ -378,7 +367,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
             f"{channel}: standard deviation {short(float(values.std()))} {unit}{chance}, change "
             f"along the run {short(drift)} {unit}"
         )
-    path = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
+    drawn = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
     yield Figure(
         "discrepancy_frames",
         "where",
@@ -386,7 +375,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame "
         "(noise). Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. "
         "Dashed: time course of the named effects, if deterministic. Yellow: frames named in the verdict.",
-        f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
+        f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{drawn}.",
         (frames, stretches),
         _frames_chart(frames, stretches, sds, data.found.where),
         PAGE_MM,
@@ -419,29 +408,11 @@ def code_table(arrays: Arrays) -> DataTable:
 _NAMED = "expected with added effects"
 
 
-def _frame_tables(arrays: Arrays) -> tuple[DataTable, DataTable]:
-    """Return means of the frames in both channels and their noise, and means over stretches of the run."""
-    number = np.asarray(arrays["frame_number"], dtype=np.float64)
-    columns, means = {"frame": number}, dict[str, FloatArray]()
-    units: dict[str, str] = {}
-    for channel, (scale, unit, _) in _SCALES.items():
-        if f"frame_{channel}" not in arrays:
-            continue
-        columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
-        centre, means[channel], n = trends(number, columns[channel])
-        path = arrays.get(f"frame_{channel}_model")
-        if path is not None and path.size:
-            columns[_model(channel)] = scale * np.asarray(path, dtype=np.float64)
-        units |= dict.fromkeys((channel, _model(channel)), unit)
-    return DataTable(columns, units), DataTable({"frame": centre, "frames": n, **means}, units, "stretches")
-
-
 def _model(channel: str) -> str:
     return f"{channel}, named effects"
 
 
 def _codes_chart(table: DataTable, marked: Sequence[Place]) -> Chart:
-    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour."""
     dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
     shaded = [
@@ -484,7 +455,7 @@ def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatA
     No stretch spans a gap between the n frames, whose numbers increase.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(number) > 1) + 1, [number.size]])
-    wanted = max(number.size // _STRETCHES, 4)
+    wanted = max(number.size // 24, 4)
     pieces = [np.linspace(a, b, max((b - a) // wanted, 1) + 1)[:-1] for a, b in itertools.pairwise(starts)]
     edges = np.append(np.unique(np.concatenate(pieces).astype(np.int64)), number.size)
     n = np.diff(edges).astype(np.float64)
@@ -507,7 +478,6 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
 def _frames_chart(
     frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place]
 ) -> Chart:
-    """Return the chart of the frames in both channels and of their noise, with the path of named effects."""
     panels = []
     for channel, sd in sds.items():
         shaded = [

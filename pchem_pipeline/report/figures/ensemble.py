@@ -188,8 +188,6 @@ def ensemble_chart(
 
 
 class _Drawn:
-    """One half of the figure: data and predictions on one axis."""
-
     def __init__(self, table: DataTable, rmse: Mapping[str, float], n_frames: int | None) -> None:
         _, axis, data, model, unit, words, self.title = next(h for h in HALVES if h.part == table.part)
         self.unit = unit_text(unit)
@@ -218,18 +216,14 @@ class _Drawn:
         return found
 
 
-def _bulk(half: _Drawn) -> slice:
-    """Return the bins that can be seen on a linear axis: above 1/300 of the peak, the last 0.2 % left out."""
+def _bulk_stack(half: _Drawn) -> Stack:
+    # what can be seen on a linear axis: above 1/300 of the peak, the last 0.2 % left out
     rest = np.cumsum(half.counts) / half.counts.sum()
     seen = np.flatnonzero((half.density > half.density.max() / 300.0) & (rest > 5e-4) & (rest < 0.998))
     if seen.size == 0:
         seen = np.flatnonzero(half.density == half.density.max())
     margin = max(2, int(seen[-1] - seen[0]) // 14)
-    return slice(max(int(seen[0]) - margin, 0), int(seen[-1]) + margin + 1)
-
-
-def _bulk_stack(half: _Drawn) -> Stack:
-    where = _bulk(half)
+    where = slice(max(int(seen[0]) - margin, 0), int(seen[-1]) + margin + 1)
     bars = half.bars(where)
     lines = half.lines(where, {suffix: model[where] for suffix, model in half.models.items()})
     if half.floor is not None:

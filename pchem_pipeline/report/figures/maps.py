@@ -72,32 +72,25 @@ _CAPTIONS = {
 
 def map_figures(data: ReportData) -> Iterator[Figure]:
     """Return a figure of each map of Appendix C, and of the line of several exposures, that has values."""
+    what = "Values of the channels" if is_strip(data.shape) else "Histogram and map"
     for name in filter(data.has_values, (*MAP_NAMES, *LINE_MAPS)):
-        known = data.ordered(name)
+        known, summary, (_, words, unit) = data.ordered(name), data.summary(name), symbol(name)
+        low, high = summary.percentiles[5.0], summary.percentiles[95.0]
+        flagged = count(summary.n_left_out, f"flagged {data.noun}")
         tables = map_tables(data.maps[name], name, data.maps.get(f"{name}_stderr"), known)
         yield Figure(
             f"map_{name}",
             "summary" if name in ("read_noise_e", "conversion_gain") else "maps",
-            symbol(name)[1].capitalize(),
+            words.capitalize(),
             _CAPTIONS[name],
-            _map_alt(data, name),
+            f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
+            f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
+            f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; "
+            f"{count(summary.n_missing, data.noun)} without a value"
+            + (f", {flagged} excluded." if summary.n_left_out else "."),
             tables,
             map_chart(tables, name, known),
         )
-
-
-def _map_alt(data: ReportData, name: str) -> str:
-    _, words, unit = symbol(name)
-    summary = data.summary(name)
-    low, high = summary.percentiles[5.0], summary.percentiles[95.0]
-    what = "Values of the channels" if is_strip(data.shape) else "Histogram and map"
-    return (
-        f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
-        f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
-        f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; "
-        f"{count(summary.n_missing, data.noun)} without a value"
-        + (f", {count(summary.n_left_out, f'flagged {data.noun}')} excluded." if summary.n_left_out else ".")
-    )
 
 
 def status_figures(data: ReportData) -> Iterator[Figure]:
@@ -128,6 +121,22 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
     columns = {name: data.fit[f"goodness_{name}"] for name in names}
     columns["misfit"] = misfit(columns["chi2"], columns["dof"])
     table = DataTable(columns, {"misfit": "standard deviations"})
+    bins, known = 20, finite(columns["p"])
+    counts, edges = np.histogram(known, bins, (0.0, 1.0))
+    mean = known.size / bins
+    spread = np.sqrt(mean * (1.0 - 1.0 / bins))
+    marks = (
+        Span(mean - 2 * spread, mean + 2 * spread, colour="band"),
+        Level(mean, colour="ink", width=0.6),
+        Steps(edges, counts, width=1.2),
+    )
+    high = 1.05 * max(float(counts.max()), mean + 2 * spread)
+    left = Stack((Panel(Axis("pixels", 0.0, high), marks),), Axis("p-value of the goodness of fit", 0.0, 1.0))
+    found = columns["q"] <= rate
+    ringed = found if is_strip(found.shape) or found.sum() <= 400 else None
+    right = sensor_stack(
+        columns["misfit"], (-4.0, 6.0), "misfit (σ)", ringed=ringed, ring="vermilion", whole=True
+    )
     yield Figure(
         "goodness",
         "goodness",
@@ -138,7 +147,7 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
         f"p-values and misfit of {count(tested, data.noun)}; {count(misfits, 'misfit')} at a false-discovery "
         f"rate of {rate:g}.",
         (table,),
-        _goodness_chart(table, rate),
+        Chart((left, right), (1.0, 1.15)),
         PAGE_MM,
     )
 
@@ -180,7 +189,6 @@ def map_chart(tables: Sequence[DataTable], name: str, known: Ordered) -> Chart:
 
 
 def _histogram_stack(known: Ordered, bins: DataTable, label: str, height_mm: float = 34.0) -> Stack:
-    """Return the histogram of a map with its median."""
     shown = robust_range(known)
     left, right, counts = (bins[name] for name in bins.columns)
     x = Axis(label, shown.low, shown.high, log=shown.logarithmic)
@@ -266,23 +274,3 @@ def status_chart(
 
 def _share(part: int, whole: int) -> str:
     return f"{part:,} ({percent(part, whole)})".replace(" ", "\N{NO-BREAK SPACE}")
-
-
-def _goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
-    """Return the p-values of all pixels against a uniform distribution, and a map of the goodness of fit."""
-    bins = 20
-    deviate, known = table["misfit"], finite(table["p"])
-    counts, edges = np.histogram(known, bins, (0.0, 1.0))
-    mean = known.size / bins
-    spread = np.sqrt(mean * (1.0 - 1.0 / bins))
-    marks = (
-        Span(mean - 2 * spread, mean + 2 * spread, colour="band"),
-        Level(mean, colour="ink", width=0.6),
-        Steps(edges, counts, width=1.2),
-    )
-    high = 1.05 * max(float(counts.max()), mean + 2 * spread)
-    left = Stack((Panel(Axis("pixels", 0.0, high), marks),), Axis("p-value of the goodness of fit", 0.0, 1.0))
-    found = table["q"] <= false_discovery_rate
-    ringed = found if is_strip(found.shape) or found.sum() <= 400 else None
-    right = sensor_stack(deviate, (-4.0, 6.0), "misfit (σ)", ringed=ringed, ring="vermilion", whole=True)
-    return Chart((left, right), (1.0, 1.15))

@@ -67,25 +67,6 @@ def method_figures(data: ReportData) -> Iterator[Figure]:
     letters = ("(a) ", "(b) ") if study and known else ("", "")
     stacks = [_study(study, letters[0])] if study else []
     stacks += [_run(known, letters[1])] if known else []
-    yield Figure(
-        "methods_gain_error",
-        "methods",
-        "Error of the conversion gain by each method",
-        "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames "
-        "for every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without "
-        "symbols: smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright "
-        "one; dotted line: above this read noise photon transfer is more precise than one sample. Right or "
-        "bottom: pixels of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
-        "Errors are clipped at 180 %.",
-        f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
-        _method_tables(study, known),
-        Chart(tuple(stacks), (2.3, 1.0) if len(stacks) > 1 else (1.0,)),
-        PAGE_MM,
-    )
-
-
-def _method_tables(study: _Rows, known: _Rows) -> tuple[DataTable, ...]:
-    """Return the errors on simulated pixels, where there are any, and on the pixels of the run."""
     tables = []
     if study:
         columns: dict[str, Any] = {"read_noise_e": [point["read_noise_e"] for point in study]}
@@ -97,7 +78,22 @@ def _method_tables(study: _Rows, known: _Rows) -> tuple[DataTable, ...]:
         tables.append(DataTable(columns, {"read_noise_e": "e-"}, "simulated"))
     gain = [method["errors"]["conversion_gain"] for method in known]
     numbers = {key: _numbers(each[key] for each in gain) for key in ("bias", "rmse", "robust_sd", "bound")}
-    return (*tables, DataTable({"method": [method["name"] for method in known], **numbers}, part="run"))
+    tables.append(DataTable({"method": [method["name"] for method in known], **numbers}, part="run"))
+    yield Figure(
+        "methods_gain_error",
+        "methods",
+        "Error of the conversion gain by each method",
+        "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames "
+        "for every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without "
+        "symbols: smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright "
+        "one; dotted line: above this read noise photon transfer is more precise than one sample. Right or "
+        "bottom: pixels of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
+        "Errors are clipped at 180 %.",
+        f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
+        tuple(tables),
+        Chart(tuple(stacks), (2.3, 1.0) if len(stacks) > 1 else (1.0,)),
+        PAGE_MM,
+    )
 
 
 def _numbers(values: Iterable[float | None]) -> FloatArray:

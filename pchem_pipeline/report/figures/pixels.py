@@ -61,11 +61,21 @@ def pixel_figures(data: ReportData) -> Iterator[Figure]:
     """Return the histograms of the shown pixels with their fits."""
     if not data.pixels:
         return
-    words = []
+    units = {"y": "pixel", "x": "pixel", "dn": "DN", "residual": "standard deviations"}
+    words, rows = [], []
     for pixel in data.pixels:
         numbers = ", ".join(f"{symbol(name)[1]} {pixel.text(name)}" for name in _TITLE_NAMES)
         state = f" ({pixel.status})" if pixel.status else ""
         words.append(f"{pixel.label} {pixel.place}: {numbers}{state}".strip())
+        row: dict[str, Any] = {"y": pixel.y, "x": pixel.x, "shown as": pixel.label}
+        for name in (*PARAMETERS, "read_noise_e"):
+            units |= dict.fromkeys((name, f"{name} standard error"), stored_unit(name))
+            row[name] = pixel.parameters.get(name, np.nan)
+            row[f"{name} standard error"] = pixel.stderr.get(name, np.nan)
+        rows.append(row | {"goodness_p": pixel.goodness_p, "fit_status": pixel.status})
+    facts = {name: [row[name] for row in rows] for name in rows[0]}
+    parts = [pixel_columns(pixel) for pixel in data.pixels]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     yield Figure(
         "pixel_fits",
         "pixels",
@@ -74,27 +84,10 @@ def pixel_figures(data: ReportData) -> Iterator[Figure]:
         "expected) / √expected; gray band: 2 sigma. In a good fit about one line in twenty is outside the "
         "band, without a pattern. Uncertainties are standard errors of the fit.",
         "Histograms with fitted densities. " + "; ".join(words) + ".",
-        _fit_tables(data.pixels),
+        (DataTable(columns, units), DataTable(facts, units, "parameters")),
         pixels_chart(data.pixels),
         PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
     )
-
-
-def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
-    """Return the histograms of pixels with what their fits expect, and their parameters."""
-    parts = [pixel_columns(pixel) for pixel in pixels]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    units = {"y": "pixel", "x": "pixel", "dn": "DN", "residual": "standard deviations"}
-    rows = []
-    for pixel in pixels:
-        row: dict[str, Any] = {"y": pixel.y, "x": pixel.x, "shown as": pixel.label}
-        for name in (*PARAMETERS, "read_noise_e"):
-            units |= dict.fromkeys((name, f"{name} standard error"), stored_unit(name))
-            row[name] = pixel.parameters.get(name, np.nan)
-            row[f"{name} standard error"] = pixel.stderr.get(name, np.nan)
-        rows.append(row | {"goodness_p": pixel.goodness_p, "fit_status": pixel.status})
-    facts = {name: [row[name] for row in rows] for name in rows[0]}
-    return DataTable(columns, units), DataTable(facts, units, "parameters")
 
 
 def _codes(pixel: PixelFit) -> IntArray:

@@ -30,9 +30,22 @@ def exposure_figures(data: ReportData) -> Iterator[Figure]:
     samples, slope = data.samples, slope_of(data)
     if samples is None or slope is None or not samples.on_line:
         return
-    words, _, _, offset = AXES[samples.against]
+    words, axis_unit, _, offset = AXES[samples.against]
     _, noun, unit = symbol(slope)
-    table = _exposure_table(samples)
+    chosen = samples.on_line
+    exposures = np.array([middle(samples.arrays["quanta_exposure"][i]) for i in chosen])
+    columns: dict[str, Any] = {
+        "sample": [samples.samples[i].name for i in chosen],
+        words: [samples.samples[i].x for i in chosen],
+        "H": exposures[:, 0],
+        "H at 16 %": exposures[:, 2],
+        "H at 84 %": exposures[:, 3],
+    }
+    # two points leave no residual
+    if len(chosen) > 2:
+        rest = np.array([middle(samples.arrays["linearity_residual"][i]) for i in chosen])
+        columns |= {"residual": rest[:, 0], "residual standard error": rest[:, 1]}
+    table = DataTable(columns, dict.fromkeys(list(columns)[2:], "e-") | {words: axis_unit})
     centre, error = middle(data.maps[slope])[:2]
     yield Figure(
         "exposures",
@@ -72,25 +85,6 @@ def transfer_figures(data: ReportData) -> Iterator[Figure]:
         (table,),
         _transfer_chart(table, gain, noise),
     )
-
-
-def _exposure_table(samples: Samples) -> DataTable:
-    """Return medians over the pixels of H and of its residuals, of the samples on the line."""
-    words, unit, *_ = AXES[samples.against]
-    chosen = samples.on_line
-    exposures = np.array([middle(samples.arrays["quanta_exposure"][i]) for i in chosen])
-    columns: dict[str, Any] = {
-        "sample": [samples.samples[i].name for i in chosen],
-        words: [samples.samples[i].x for i in chosen],
-        "H": exposures[:, 0],
-        "H at 16 %": exposures[:, 2],
-        "H at 84 %": exposures[:, 3],
-    }
-    # two points leave no residual
-    if len(chosen) > 2:
-        rest = np.array([middle(samples.arrays["linearity_residual"][i]) for i in chosen])
-        columns |= {"residual": rest[:, 0], "residual standard error": rest[:, 1]}
-    return DataTable(columns, dict.fromkeys(list(columns)[2:], "e-") | {words: unit})
 
 
 def _transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:

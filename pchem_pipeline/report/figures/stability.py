@@ -18,12 +18,12 @@ from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 
-#: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
-_MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
+#: Points of a curve at most; longer runs are averaged over frames.
+_MOST_POINTS = 1200
 _LINES = ("row", "column")
 #: Values of lines that are worked on at a time.
 _AT_ONCE = 1 << 17
-_WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
+_EXPECTED = Level(1.0, colour="ink", width=0.6, dash="--")  # sampling noise alone
 
 
 def stability_figures(sums: StackSums | None) -> list[Figure]:
@@ -37,19 +37,27 @@ def _frame_figure(sums: StackSums) -> Iterator[Figure]:
     means, power = frame_table(sums), power_table(sums)
     together = math.ceil(sums.n_frames / _MOST_POINTS)
     averaged = f" over {together} frames each" if together > 1 else " of each frame"
-    error = float(means["expected error"][0])
-    scatter = float(means["mean"].std())
+    centre, error, scatter = float(means["mean"].mean()), means["expected error"], float(means["mean"].std())
+    spectrum = (
+        Line(power["frequency"], power["largest"], colour="sky", width=0.6, label="largest"),
+        Line(power["frequency"], power["power"], label="mean power"),
+        _EXPECTED,
+    )
+    some = bool((power["power"] > 0.0).any())  # of frames that are all alike there is none
+    panel = Panel(Axis("power / expected", log=some), spectrum)
+    ends = centre - 2 * error, centre + 2 * error
+    series = _series(means["frame"], means["mean"], ends, "mean", "frame", 0.7)
     yield Figure(
         "frame_means",
         "stability",
         "Mean of the frames",
         f"Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum "
         "relative to independent pixels (1): mean and maximum of neighbouring frequencies.",
-        f"Mean of {count(sums.n_frames, 'frame')}: {short(float(means['mean'].mean()), 5)} DN, scatter "
-        f"{short(scatter)} DN ({short(error)} DN for independent pixels); largest power "
+        f"Mean of {count(sums.n_frames, 'frame')}: {short(centre, 5)} DN, scatter "
+        f"{short(scatter)} DN ({short(float(error[0]))} DN for independent pixels); largest power "
         f"{short(float(power['largest'].max()), 2)} times the expected one.",
         (means, power),
-        _frames_chart(means, power),
+        Chart((series, Stack((panel,), Axis("frequency (1/frame)", log=True), height_mm=44.0))),
     )
 
 
@@ -58,11 +66,16 @@ def _profile_figure(sums: StackSums) -> Iterator[Figure]:
     tables = [table for table in tables if table["mean signal"].size > 1]
     if not tables:
         return
-    words = []
+    words, stacks = [], []
     for table in tables:
-        low, high = (table[name] for name in ("expected from", "expected to"))
-        outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
-        words.append(f"{outside} of {count(low.size, table.part)} outside 2 sigma")
+        name, signal, ends = (
+            next(iter(table.columns)),
+            table["mean signal"],
+            (table["expected from"], table["expected to"]),
+        )
+        outside = int(((signal < ends[0]) | (signal > ends[1])).sum())
+        words.append(f"{outside} of {count(signal.size, table.part)} outside 2 sigma")
+        stacks.append(_series(table[name], signal, ends, "median", f"{table.part} {name} (pixel)", 0.8))
     yield Figure(
         "profiles",
         "stability",
@@ -71,7 +84,7 @@ def _profile_figure(sums: StackSums) -> Iterator[Figure]:
         "for independent pixels.",
         f"Profiles of the mean signal: {'; '.join(words)}.",
         tuple(tables),
-        _profiles_chart(tables),
+        Chart(tuple(stacks)),
     )
 
 
@@ -116,7 +129,7 @@ def power_table(sums: StackSums) -> DataTable:
     series = sums.frame_mean - sums.frame_mean.mean()
     power = np.abs(np.fft.rfft(series)[1:]) ** 2 / series.size / max(_chance(sums) ** 2, 1e-300)
     frequency = np.arange(1, power.size + 1) / series.size
-    edges = np.unique(np.geomspace(1, power.size + 1, _MOST_FREQUENCIES).astype(np.int64)) - 1
+    edges = np.unique(np.geomspace(1, power.size + 1, 160).astype(np.int64)) - 1
     starts = edges[:-1] if edges.size > 1 else edges
     lengths = np.diff(np.append(starts, power.size))
     columns = {
@@ -133,7 +146,8 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
     Chance are two standard errors of the median of that many pixels drawn from the whole sensor.
     """
     image, (middle, width) = sums.mean_signal, sums.typical_signal
-    reach = 2.0 * _WIDTH * width / math.sqrt(image.shape[1 - axis])
+    # the standard error of a median is so many times that of a mean
+    reach = 2.0 * math.sqrt(math.pi / 2.0) * width / math.sqrt(image.shape[1 - axis])
     medians = np.median(image, axis=1 - axis)
     columns = {
         "yx"[axis]: np.arange(medians.size),
@@ -185,21 +199,6 @@ def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable
     return DataTable({"frequency": frequency, "power": power}, {"frequency": f"1/{unit}"}, part)
 
 
-def _frames_chart(means: DataTable, power: DataTable) -> Chart:
-    """Return the chart of the mean of the frames, and its spectrum below."""
-    centre, error = float(means["mean"].mean()), means["expected error"]
-    spectrum = (
-        Line(power["frequency"], power["largest"], colour="sky", width=0.6, label="largest"),
-        Line(power["frequency"], power["power"], label="mean power"),
-        _one(),
-    )
-    some = bool((power["power"] > 0.0).any())  # of frames that are all alike there is none
-    panel = Panel(Axis("power / expected", log=some), spectrum)
-    below = Stack((panel,), Axis("frequency (1/frame)", log=True), height_mm=44.0)
-    ends = centre - 2 * error, centre + 2 * error
-    return Chart((_series(means["frame"], means["mean"], ends, "mean", "frame", 0.7), below))
-
-
 def _series(
     x: FloatArray, y: FloatArray, ends: tuple[FloatArray, FloatArray], what: str, axis: str, width: float
 ) -> Stack:
@@ -209,18 +208,7 @@ def _series(
     return Stack((panel,), Axis(axis), height_mm=44.0)
 
 
-def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of the profiles of rows and columns."""
-    stacks = []
-    for table in tables:
-        name, ends = next(iter(table.columns)), (table["expected from"], table["expected to"])
-        axis = f"{table.part} {name} (pixel)"
-        stacks.append(_series(table[name], table["mean signal"], ends, "median", axis, 0.8))
-    return Chart(tuple(stacks))
-
-
 def _spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) -> Chart:
-    """Return the chart of spatial spectra: of the fixed pattern, and below of the noise."""
     stacks = []
     for tables, title in ((fixed, "fixed pattern"), (temporal, "noise")):
         lines = []
@@ -232,12 +220,7 @@ def _spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) ->
             lines.append(Line(table["frequency"], power, colour=colour, width=0.8, label=f"{line}s"))
         known = np.concatenate([[1.0], *(line.y[np.isfinite(line.y)] for line in lines)])
         y = Axis("power / expected", min(0.8 * known.min(), 0.09), max(1.25 * known.max(), 11.0), log=True)
-        panel = Panel(y, (*lines, _one()), legend="upper right", columns=2, room=(3.0, 3.0))
+        panel = Panel(y, (*lines, _EXPECTED), legend="upper right", columns=2, room=(3.0, 3.0))
         x = Axis("frequency (1/row, 1/column)", 0.0, 0.5)
         stacks.append(Stack((panel,), x, title, height_mm=44.0))
     return Chart(tuple(stacks))
-
-
-def _one() -> Level:
-    """Return the line of sampling noise."""
-    return Level(1.0, colour="ink", width=0.6, dash="--")

@@ -20,13 +20,11 @@ from pchem_pipeline.report.pages.summary import Flag
 from pchem_pipeline.report.pages.tables import RMSES, Table
 
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
-#: Version of the layout of ``compare.json``.
-COMPARE_VERSION = 1
 
 #: At most so many sentences on what changed are shown; the JSON has all.
 _MOST_WORDS = 12
-#: At most so many places are shown in a cell, and pixels in a table; files have all.
-_MOST_PLACES, _MOST_PIXELS = 8, 100
+#: At most so many places are shown in a cell; files have all.
+_MOST_PLACES = 8
 #: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
 _MOST_DRAWN = 8
 
@@ -123,7 +121,7 @@ def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> S
 def _numbers(found: Comparison) -> dict[str, Any]:
     parts = ("median", "median_stderr", "robust_sd")
     return {
-        "compare_version": COMPARE_VERSION,
+        "compare_version": 1,  # of this layout
         "changed": found.changed,
         "sentence": sentence_of(found),
         "tolerance": found.tolerance,
@@ -209,7 +207,6 @@ def _nonzero_counts(numbers: Mapping[str, str]) -> str:
 
 
 def _defect_words(row: HistoryRow) -> str:
-    """Return the number of defects by kind, and where they differ from those of the first run."""
     parts = [_nonzero_counts({kind: row[f"{kind}_pixels"] for kind in map(words_of, FAULTS)}) or "none"]
     for change in by_change(()):
         if places := row[f"defects_{change.replace(' ', '_')}"].split():
@@ -249,10 +246,22 @@ def pair_tables(pair: Pair) -> list[Table]:
         for each in pair.settings
     ]
     versions = [_both("program or algorithm", pair, each) for each in pair.versions]
+    shown, one, other = pair.defects[:100], pair.one.label, pair.other.label
+    rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
+    defects = [
+        {"y": f"{each.y}", "x": f"{each.x}", one: each.before or "none", other: each.now or "none"}
+        for each in shown
+    ]
+    heads = [f"{grade} in {other}" for grade in _GRADES]
+    qualities = [
+        {"": f"{grade} in {one}"} | dict(zip(heads, (f"{int(n):,}" for n in row), strict=True))
+        for grade, row in zip(_GRADES, pair.transitions, strict=False)
+    ]
+    kinds = f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}"
     tables = (
         _map_table(pair),
-        _defects(pair),
-        _transitions(pair),
+        Table(f"defects-{pair.key}", "Defects that changed", kinds, defects),
+        Table(f"quality-{pair.key}", "Pixels by quality", "", qualities),
         Table(f"settings-{pair.key}", "Settings that differ", "", settings),
         Table(f"versions-{pair.key}", "Versions that differ", "", versions),
     )
@@ -285,29 +294,6 @@ def _map_table(pair: Pair) -> Table:
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
         rows,
     )
-
-
-def _defects(pair: Pair) -> Table:
-    shown, one, other = pair.defects[:_MOST_PIXELS], pair.one.label, pair.other.label
-    rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
-    return Table(
-        f"defects-{pair.key}",
-        "Defects that changed",
-        f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}",
-        [
-            {"y": f"{each.y}", "x": f"{each.x}", one: each.before or "none", other: each.now or "none"}
-            for each in shown
-        ],
-    )
-
-
-def _transitions(pair: Pair) -> Table:
-    heads = [f"{grade} in {pair.other.label}" for grade in _GRADES]
-    rows = [
-        {"": f"{grade} in {pair.one.label}"} | dict(zip(heads, (f"{int(n):,}" for n in row), strict=True))
-        for grade, row in zip(_GRADES, pair.transitions, strict=False)
-    ]
-    return Table(f"quality-{pair.key}", "Pixels by quality", "", rows)
 
 
 def _both(what: str, pair: Pair, each: Setting) -> dict[str, str]:

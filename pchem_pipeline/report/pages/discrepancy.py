@@ -31,7 +31,7 @@ from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, gravest_fi
 from pchem_pipeline.report.pages.tables import Table
 
 #: Longer lists are in ``discrepancy.json`` only.
-_MOST_PLACES, _MOST_CANDIDATES = 12, 8
+_MOST_PLACES = 12
 #: Maps of the survey in words.
 _SURVEYED = {
     "next_x": "neighbours in a row correlated",
@@ -53,12 +53,66 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
         "where": [_where(data, found.where)],
         "evidence": [
             *[_candidates(data, step, i) for i, step in enumerate(found.steps)],
-            _factors(found.steps),
+            Table(
+                "discrepancy-factors",
+                "What is certain of an effect that has no name",
+                "Certain is what all candidates that remain have in common.",
+                [
+                    {
+                        "factor": FACTORS[name],
+                        "value": " or ".join(values),
+                        "": "certain" if len(values) == 1 else "open",
+                    }
+                    for step in found.steps
+                    if any(len(values) > 1 for values in step.factors.values())
+                    for name, values in step.factors.items()
+                ],
+            ),
             _rivals(data),
-            _separate(found.steps),
+            Table(
+                "discrepancy-separate",
+                "Measurements that decide",
+                "How to tell the effects of the verdict from similar ones.",
+                [
+                    {"similar effect": rival, "measurement: difference": text}
+                    for rival, text in dict.fromkeys(
+                        pair for step in found.steps for pair in step.separate.items()
+                    )
+                ],
+            ),
         ],
         "parameters": [_parameters(data), _moved(found)],
-        "limits": [_untestable(data), _unexplained(found.unexplained), _defects(found), _examined(data)],
+        "limits": [
+            Table(
+                "discrepancy-untestable",
+                "Effects that are not testable with these data",
+                "",
+                [
+                    {"effect": tag, "name": data.title(tag), "reason, and data that would show it": why or ""}
+                    for tag, why in found.untestable.items()
+                ],
+            ),
+            Table(
+                "discrepancy-unexplained",
+                "Unexplained",
+                "Remaining disagreements with the effects above in the model.",
+                [
+                    {
+                        "disagreement": place.sentence or place.statistic,
+                        "sigma": signed(place.z),
+                        "where": place_text(place),
+                    }
+                    for place in found.unexplained[:_MOST_PLACES]
+                ],
+            ),
+            Table(
+                "discrepancy-defects",
+                "Defects",
+                "Candidates that failed and were not compared; the verdict does not cover them.",
+                [{"effect": tag, "error": error} for tag, error in found.defects.items()],
+            ),
+            _examined(data),
+        ],
     }
     return {part: [table for table in tables if table.rows] for part, tables in parts.items()}
 
@@ -105,7 +159,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
     # an empirical description has no competitors
     several = len(step.candidates) > 1 and step.verdict != "described"
-    for candidate in step.candidates[: _MOST_CANDIDATES if several else 0]:
+    for candidate in step.candidates[: 8 if several else 0]:
         behind = candidate.score - best
         given = [
             f"{name} {f'{value:.3g}' if isinstance(value, int | float) else value}"
@@ -155,34 +209,6 @@ def _rivals(data: DiscrepancyData) -> Table:
     )
 
 
-def _factors(steps: Sequence[Step]) -> Table:
-    return Table(
-        "discrepancy-factors",
-        "What is certain of an effect that has no name",
-        "Certain is what all candidates that remain have in common.",
-        [
-            {
-                "factor": FACTORS[name],
-                "value": " or ".join(values),
-                "": "certain" if len(values) == 1 else "open",
-            }
-            for step in steps
-            if any(len(values) > 1 for values in step.factors.values())
-            for name, values in step.factors.items()
-        ],
-    )
-
-
-def _separate(steps: Sequence[Step]) -> Table:
-    found = dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items())
-    return Table(
-        "discrepancy-separate",
-        "Measurements that decide",
-        "How to tell the effects of the verdict from similar ones.",
-        [{"similar effect": rival, "measurement: difference": text} for rival, text in found],
-    )
-
-
 def _how(step: Step, found: Verdict) -> str:
     """Return the status of an effect that was not named: empirical, or only the likeliest."""
     if step.effect:
@@ -216,7 +242,6 @@ def _parameters(data: DiscrepancyData) -> Table:
 
 
 def _meaning(tag: str, name: str) -> str:
-    """Return what a parameter of an effect is, in a few words."""
     if name == "frequency":
         return "frequency, or this plus or minus a multiple of the line rate"
     known = effect_classes().get(tag)
@@ -224,7 +249,6 @@ def _meaning(tag: str, name: str) -> str:
 
 
 def _values(step: Step) -> dict[str, str]:
-    """Format the parameters and text fields of an effect."""
     numbers = {n: fitted_or_chosen(p.value, p.stderr, unit_text(p.unit)) for n, p in step.parameters.items()}
     return numbers | step.form
 
@@ -254,45 +278,7 @@ def _moved(found: Verdict) -> Table:
     )
 
 
-def _untestable(data: DiscrepancyData) -> Table:
-    return Table(
-        "discrepancy-untestable",
-        "Effects that are not testable with these data",
-        "",
-        [
-            {"effect": tag, "name": data.title(tag), "reason, and data that would show it": why or ""}
-            for tag, why in data.found.untestable.items()
-        ],
-    )
-
-
-def _unexplained(places: Sequence[Place]) -> Table:
-    return Table(
-        "discrepancy-unexplained",
-        "Unexplained",
-        "Remaining disagreements with the effects above in the model.",
-        [
-            {
-                "disagreement": place.sentence or place.statistic,
-                "sigma": signed(place.z),
-                "where": place_text(place),
-            }
-            for place in places[:_MOST_PLACES]
-        ],
-    )
-
-
-def _defects(found: Verdict) -> Table:
-    return Table(
-        "discrepancy-defects",
-        "Defects",
-        "Candidates that failed and were not compared; the verdict does not cover them.",
-        [{"effect": tag, "error": error} for tag, error in found.defects.items()],
-    )
-
-
 def _surveyed(name: str, data: DiscrepancyData) -> str:
-    """Describe a deviating map of the whole sensor."""
     kind, _, rest = name.partition(".")
     if kind == "pairs":
         mode, _, channel = rest.partition(".")
@@ -318,8 +304,8 @@ def _examined(data: DiscrepancyData) -> Table:
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
 
-#: Changes of a parameter in standard errors of a pixel: below these negligible, and none.
-_IMMATERIAL, _NOT_MOVED = 0.2, 0.01
+#: Change of a parameter in standard errors of a pixel that is none.
+_NOT_MOVED = 0.01
 #: The parts of the page below the verdict.
 PARTS = (
     Section(
@@ -413,23 +399,34 @@ def _signature(found: Verdict) -> tuple[str, ...]:
 
 def key_facts(data: DiscrepancyData) -> list[KeyFact]:
     """Return the numbers of the first screen."""
-    found = data.found
-    return [*_effect_facts(data), *_moved_fact(found), *_chance_fact(found), *_gap_fact(found)]
+    found, facts = data.found, _effect_facts(data)[:4]
+    steps = filter(found.part_of_model, found.steps)
+    moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
+    name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
+    if largest is not None and abs(largest.in_stderr) >= _NOT_MOVED:
+        small = ", negligible" if abs(largest.in_stderr) < 0.2 else ""
+        value = f"{_signed(largest.median)} {unit_text(largest.unit)}".strip()
+        text = f"median over pixels; {_signed(largest.in_stderr)} standard errors of one pixel{small}"
+        facts.append(KeyFact(f"largest change: {_parameter_name(name)}", value, (text,)))
+    if math.isfinite(found.p_global.before):
+        more = ["of the largest deviation of all statistics, if the model holds"]
+        more += [f"Student's t, scatter of {found.replicates} simulated stacks"] if found.replicates else []
+        before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
+        value = f"{before} → {after}" if after and found.steps else before
+        facts.append(KeyFact("p-value", value, tuple(more)))
+    return [*facts, _gap_fact(found)] if math.isfinite(found.gap.before) else facts
 
 
-def _gap_fact(found: Verdict) -> list[KeyFact]:
-    """Return the closed share of the gap, with the gap below it."""
+def _gap_fact(found: Verdict) -> KeyFact:
     gap = found.gap
-    if not math.isfinite(gap.before):
-        return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
     before = micronats(gap.before, gap.interval_before)
     nats = f"{before} → {gap.after_text}" if extended else before
     unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
     if not extended or gap.after <= gap.floor:
-        return [KeyFact("gap between data and model", nats, (unit, chance))]
+        return KeyFact("gap between data and model", nats, (unit, chance))
     more = (f"{nats} {unit}", chance)
-    return [KeyFact(f"of the gap closed{found.closed_by}", percent(gap.closed_fraction), more)]
+    return KeyFact(f"of the gap closed{found.closed_by}", percent(gap.closed_fraction), more)
 
 
 def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -443,33 +440,11 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
             more += [f"in {step.place}"] if step.place else []
             more += [] if data.found.part_of_model(step) else ["proposed, not in the model"]
             facts.append(KeyFact(data.title(step.likeliest), value, tuple(more)))
-    return facts[:4]
-
-
-def _moved_fact(found: Verdict) -> list[KeyFact]:
-    steps = filter(found.part_of_model, found.steps)
-    moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
-    name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
-    if largest is None or abs(largest.in_stderr) < _NOT_MOVED:
-        return []
-    small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
-    value = f"{_signed(largest.median)} {unit_text(largest.unit)}".strip()
-    more = f"median over pixels; {_signed(largest.in_stderr)} standard errors of one pixel{small}"
-    return [KeyFact(f"largest change: {_parameter_name(name)}", value, (more,))]
+    return facts
 
 
 def _signed(value: float) -> str:
     return short(value, 2) if value < 0 or not math.isfinite(value) else f"+{short(value, 2)}"
-
-
-def _chance_fact(found: Verdict) -> list[KeyFact]:
-    if not math.isfinite(found.p_global.before):
-        return []
-    more = ["of the largest deviation of all statistics, if the model holds"]
-    more += [f"Student's t, scatter of {found.replicates} simulated stacks"] if found.replicates else []
-    before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
-    value = f"{before} → {after}" if after and found.steps else before
-    return [KeyFact("p-value", value, tuple(more))]
 
 
 def remarks(data: DiscrepancyData) -> list[Flag]:

@@ -25,32 +25,20 @@ if TYPE_CHECKING:
     from pchem_pipeline.report.pages.tables import Table
 
 
-@dataclass(frozen=True)
-class Term:
-    """A word of the field: how it is written in texts, and what it means."""
-
-    spellings: tuple[str, ...]
-    meaning: str
-
-    @property
-    def name(self) -> str:
-        """Its name in the glossary."""
-        return self.spellings[0]
-
-    @property
-    def id(self) -> str:
-        """Anchor of the entry."""
-        return "term-" + re.sub(r"\W+", "-", self.name.lower()).strip("-")
+#: Words of the field, each as it is written in texts (first its name), to what they mean.
+GLOSSARY = {tuple(key.split(" | ")): text for key, text in tomllib.loads(text_of("glossary.toml")).items()}
 
 
-#: In the order of the list.
-GLOSSARY = [
-    Term(tuple(key.split(" | ")), text) for key, text in tomllib.loads(text_of("glossary.toml")).items()
-]
+def anchor_of(name: str) -> str:
+    """Return the anchor of an entry of the glossary."""
+    return "term-" + re.sub(r"\W+", "-", name.lower()).strip("-")
 
-_BY_SPELLING = {spelling.lower(): term for term in GLOSSARY for spelling in term.spellings}
-_WORDS = "|".join(re.escape(word) for word in sorted(_BY_SPELLING, key=len, reverse=True))
-_ANY = re.compile(rf"(?<![\w-])(?:{_WORDS})(?![\w-])", re.IGNORECASE)
+
+_BY_SPELLING = {spelling.lower(): anchor_of(term[0]) for term in GLOSSARY for spelling in term}
+_ANY = re.compile(
+    rf"(?<![\w-])(?:{'|'.join(map(re.escape, sorted(_BY_SPELLING, key=len, reverse=True)))})(?![\w-])",
+    re.IGNORECASE,
+)
 
 
 def explained(text: str) -> Markup:
@@ -58,20 +46,17 @@ def explained(text: str) -> Markup:
     seen = set()
 
     def link(found: re.Match[str]) -> str:
-        term = _BY_SPELLING[found[0].lower()]
-        if term.id in seen:
+        anchor = _BY_SPELLING[found[0].lower()]
+        if anchor in seen:
             return found[0]
-        seen.add(term.id)
-        return f'<a class="term" href="#{term.id}">{found[0]}</a>'
+        seen.add(anchor)
+        return f'<a class="term" href="#{anchor}">{found[0]}</a>'
 
     return Markup(_ANY.sub(link, str(escape(text))))
 
 
-#: Numbers of a table that the page keeps.
-_LARGEST_TABLE = 6_000
 #: Folder of the library that draws charts.
 _LIBRARY = "vendor/uplot"
-_FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
 
 @dataclass(frozen=True)
@@ -198,7 +183,7 @@ def figure_tables(figures: Sequence[Figure]) -> dict[str, list[tuple[str, str]]]
         return base64.b64encode(gzip.compress(csv_text(table).encode(), 6, mtime=0)).decode("ascii")
 
     return {
-        figure.name: [(each.part, packed(each)) for each in figure.tables if each.size <= _LARGEST_TABLE]
+        figure.name: [(each.part, packed(each)) for each in figure.tables if each.size <= 6_000]
         for figure in figures
     }
 
@@ -215,7 +200,8 @@ def _template(name: str) -> jinja2.Template:
     environment.filters["together"] = _together
     environment.filters["explained"] = lambda text: explained(_together(visible(text)))
     environment.filters["name"] = short_name
-    environment.globals["flag_signs"] = _FLAG_SIGNS
+    environment.filters["anchor"] = anchor_of
+    environment.globals["flag_signs"] = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
     return environment.get_template(name)
 
 

@@ -135,7 +135,6 @@ def _page_sections(
 
 
 def _intro(section: Section, data: ReportData) -> str:
-    """Return the introduction of a section; of maps and exposures it depends on the run."""
     if section.id == "maps" and is_strip(data.shape):
         points = "Points: channels with their standard errors"
         return f"{points}; crosses at the bottom: channels without a value."

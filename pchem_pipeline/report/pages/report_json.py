@@ -24,19 +24,16 @@ from pchem_pipeline.report.pages.summary import (
 )
 from pchem_pipeline.report.style.ranges import finite
 
-#: Version of the layout of ``report.json``.
-REPORT_VERSION = 1
-
 
 def report_numbers(data: ReportData) -> dict[str, Any]:
     """Return the numbers of a report as JSON data; what is not known is None.
 
     The keys ``summary``, ``ensemble`` (with ``rmse``) and ``fit_status`` are always there.
     """
-    remarks = flags(data)
+    remarks, p = flags(data), finite(data.fit.get("goodness_p", np.empty(0)))
     numbers: dict[str, Any] = plain(
         {
-            "report_version": REPORT_VERSION,
+            "report_version": 1,  # of this layout
             "title": data.title,
             "sentence": sentence(data),
             "answers": [asdict(answer) for answer in answers(data, remarks)],
@@ -50,13 +47,25 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
                 "integration_time": data.integration_time,
                 "camera": data.camera or None,
             },
-            "summary": _summary(data),
+            "summary": {
+                name: {
+                    **_numbers_of(name, data.summary(name)),
+                    "pixel_stderr": data.pixel_error(name),
+                    "parts": [asdict(parts) for parts in data.parts.get(name, ())],
+                }
+                for name in data.maps
+                if not name.endswith("_stderr")
+            },
             "regions": {
                 region: {name: _numbers_of(name, each) for name, each in data.in_region(region).items()}
                 for region in data.regions
             },
             "fit_status": _fit_status(data),
-            "goodness_of_fit": _goodness(data),
+            "goodness_of_fit": {
+                "n_pixels": int(p.size),
+                "median_p": float(np.median(p)) if p.size else None,
+                "fraction_below_0.001": float((p < 1e-3).mean()) if p.size else None,
+            },
             "ensemble": {"rmse": {}, **data.ensemble_facts},
             "moments": list(data.moments),
             "electron_numbers": {
@@ -64,7 +73,15 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
                 for name in ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
                 if name in data.ensemble
             },
-            "truth": _truth(data),
+            "truth": {
+                name: {
+                    "median": found.true_median,
+                    "rmse": found.rmse,
+                    "pull_mean": np.mean(found.pulls) if found.pulls.size else None,
+                    "pull_sd": np.std(found.pulls) if found.pulls.size else None,
+                }
+                for name, found in truth_errors(data).items()
+            },
             "samples": _samples(data),
             "overscan": data.overscan_medians or None,
             "missing": dict(data.missing),
@@ -84,18 +101,6 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
 def report_json(data: ReportData) -> str:
     """Return ``report.json`` as text: strict JSON (no NaN), sorted as written, ending in a newline."""
     return json.dumps(report_numbers(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _summary(data: ReportData) -> dict[str, Any]:
-    return {
-        name: {
-            **_numbers_of(name, data.summary(name)),
-            "pixel_stderr": data.pixel_error(name),
-            "parts": [asdict(parts) for parts in data.parts.get(name, ())],
-        }
-        for name in data.maps
-        if not name.endswith("_stderr")
-    }
 
 
 def _numbers_of(name: str, summary: MapSummary) -> dict[str, Any]:
@@ -148,24 +153,3 @@ def _samples(data: ReportData) -> dict[str, Any] | None:
         for i, sample in enumerate(data.samples.samples)
     ]
     return {"against": data.samples.against, "rows": rows}
-
-
-def _goodness(data: ReportData) -> dict[str, Any]:
-    p = finite(data.fit.get("goodness_p", np.empty(0)))
-    return {
-        "n_pixels": int(p.size),
-        "median_p": float(np.median(p)) if p.size else None,
-        "fraction_below_0.001": float((p < 1e-3).mean()) if p.size else None,
-    }
-
-
-def _truth(data: ReportData) -> dict[str, Any]:
-    return {
-        name: {
-            "median": found.true_median,
-            "rmse": found.rmse,
-            "pull_mean": np.mean(found.pulls) if found.pulls.size else None,
-            "pull_sd": np.std(found.pulls) if found.pulls.size else None,
-        }
-        for name, found in truth_errors(data).items()
-    }

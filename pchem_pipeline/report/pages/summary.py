@@ -66,15 +66,8 @@ def criteria(data: ReportData) -> list[Criterion]:
 
 
 def _read_noise(data: ReportData) -> _Found:
-    if not data.has_values("read_noise_e"):
-        return None
-    median = data.summary("read_noise_e").median
+    median = data.summary("read_noise_e").median if data.has_values("read_noise_e") else np.nan
     return (median, "median read noise") if np.isfinite(median) else None
-
-
-def _failed(data: ReportData) -> _Found:
-    pixels = pixel_counts(data)
-    return pixels.failed / max(pixels.total, 1), f"{data.noun}s without a value"
 
 
 def _hot(data: ReportData) -> _Found:
@@ -88,7 +81,6 @@ def _hot(data: ReportData) -> _Found:
 
 
 def _outlying(data: ReportData) -> _Found:
-    """Return the largest share of outliers in the maps of gain, bias and read noise."""
     if data.few_channels:
         return None
     shares = []
@@ -114,7 +106,10 @@ def _gain_spread(data: ReportData) -> _Found:
 
 _MEASURES: dict[str, tuple[Callable[[ReportData], _Found], Callable[[float], str]]] = {
     "read_noise_e": (_read_noise, lambda value: f"{short(value)} e⁻"),
-    "failed_pixels": (_failed, percent),
+    "failed_pixels": (
+        lambda data: (pixel_counts(data).failed_share, f"{data.noun}s without a value"),
+        percent,
+    ),
     "flagged_pixels": (lambda data: (data.flagged_share(), f"flagged {data.noun}s"), percent),
     "hot_pixels": (_hot, percent),
     "outlying_pixels": (_outlying, percent),
@@ -165,9 +160,6 @@ def nothing_found(look: QuickLook) -> str:
 
 KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "charge_per_level", "quanta_exposure", "bias")
 
-#: Ratio of an RMSE to that of sampling noise alone up to which a significant difference is small, and from
-#: which it is large.
-_RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 #: Share of pixels with one reason for caution from which the first screen says so.
 _CAUTION_SHARE = 0.01
 #: Read noise, e-, above which electrons cannot be counted.
@@ -206,6 +198,11 @@ class PixelCounts:
     def fitted(self) -> int:
         """Pixels with a value."""
         return self.total - self.failed
+
+    @property
+    def failed_share(self) -> float:
+        """Share of pixels without a value."""
+        return self.failed / max(self.total, 1)
 
 
 def pixel_counts(data: ReportData) -> PixelCounts:
@@ -266,7 +263,6 @@ def sentence(data: ReportData) -> str:
 
 
 def _medians(data: ReportData) -> str:
-    """Return the medians in a sentence, or why there are none."""
     flagged = int(data.flagged.sum())
     if data.mostly_flagged:
         return (
@@ -303,7 +299,7 @@ def _levels(data: ReportData) -> Iterator[Flag]:
 
 def _failed_pixels(data: ReportData) -> Iterator[Flag]:
     pixels = pixel_counts(data)
-    share = pixels.failed / max(pixels.total, 1)
+    share = pixels.failed_share
     text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
         allowed = percent(data.allowed_failed)
@@ -334,7 +330,6 @@ def _spaced_codes(data: ReportData) -> Iterator[Flag]:
 
 
 def _defects(data: ReportData) -> Iterator[Flag]:
-    """Count the faults by kind."""
     counts = {} if data.defects is None else data.defects.counts()
     names = [words_of(kind) for kind in FAULTS | Defect.TELEGRAPH]
     if found := [f"{counts[name]:,} {name}" for name in names if name in counts]:
@@ -437,9 +432,9 @@ def _agreement(data: ReportData) -> Iterator[Flag]:
         p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += "" if p is None else f" (chi-square: {p_value_text(p)})"
-        if ratio <= _RMSE_GOOD or (p is not None and p >= SIGNIFICANCE):
+        if ratio <= 1.3 or (p is not None and p >= SIGNIFICANCE):
             yield Flag("good", f"{text}: the model describes the data.")
-        elif ratio <= _RMSE_BAD:
+        elif ratio <= 3.0:
             yield Flag("caution", f"{text}: small differences remain.")
         else:
             yield Flag("serious", f"{text}: the model does not describe the data.")
@@ -458,14 +453,12 @@ VERDICT_LEVELS: dict[str, Level] = {
 
 
 def _discrepancy(data: ReportData) -> Iterator[Flag]:
-    """Say what was found to be missing from the model."""
     if data.discrepancy is not None:
         found = data.discrepancy.found
         yield Flag(VERDICT_LEVELS.get(found.verdict, "note"), _as_sentence(typeset(found.sentence)))
 
 
 def _quick_look(data: ReportData) -> Iterator[Flag]:
-    """Say what the quick look found, or what it would have found."""
     look = data.quick_look
     if look is None or not look.checks:
         return
@@ -582,7 +575,6 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
 
 
 def _not_looked_for(data: ReportData) -> str:
-    """Say what the quick checks cannot find."""
     if data.quick_look is None or not data.quick_look.checks:
         return " Missing effects were not searched for."
     missing = data.quick_look.missing
@@ -595,8 +587,6 @@ def _not_looked_for(data: ReportData) -> str:
 
 #: Stands for the run in a command.
 RUN = "RUN"
-#: Frames that a search for what the model is missing needs.
-_SEARCHED = 600
 
 
 @dataclass(frozen=True)
@@ -652,7 +642,7 @@ def next_steps(data: ReportData) -> list[Step]:
         ]
     if data.mostly_coarse:
         found.append(Step(f"pchem run {RUN}", "set fit.likelihood: auto in the YAML and run again"))
-    if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
+    if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= 600:
         found.append(Step(f"pchem discrepancy {RUN}", "search for effects missing from the model"))
     if not found:
         found.append(Step(f"pchem view {RUN}", "view every pixel in the browser"))

@@ -23,10 +23,10 @@ from pchem_pipeline.base.wording import (
     signed,
     unit_text,
 )
-from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples, truth_errors
+from pchem_pipeline.report.data import ReportData, truth_errors
 from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
@@ -75,7 +75,11 @@ def _quick_look(data: ReportData) -> Table:
                 "check": capitalised(check.title),
                 "found": ("in the model" if check.in_model else "yes") if check.found else "no",
                 "size": size_text(check) if check.found else "",
-                "detection limit": _limit_text(check),
+                "detection limit": size_text(
+                    replace(check, size=check.limit, size_e=math.nan, share=math.nan)
+                )
+                if math.isfinite(check.limit)
+                else "not known",
                 "p-value": _chance_text(check.p_global),
                 "where": check.where if check.found else "",
             }
@@ -83,12 +87,6 @@ def _quick_look(data: ReportData) -> Table:
         ],
         "discrepancy",
     )
-
-
-def _limit_text(check: Check) -> str:
-    if not math.isfinite(check.limit):
-        return "not known"
-    return size_text(replace(check, size=check.limit, size_e=math.nan, share=math.nan))
 
 
 def _chance_text(p: float) -> str:
@@ -102,7 +100,19 @@ def _parameters(data: ReportData) -> Table:
         f"Median over the {data.noun}s with its standard error, robust standard deviation between "
         f"{data.noun}s (1.4826 MAD), median 1 sigma error per {data.noun}, percentiles, and outliers beyond "
         f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
-        [_parameter_row(data, name) for name in _known(data)],
+        [
+            {
+                "parameter": heading(name),
+                "median": measured(summary.median, summary.median_stderr),
+                "spread": short(summary.robust_sd),
+                f"error per {data.noun}": "not known" if error is None else short(error, 2),
+                **{f"{p:g} %": short(value, 4) for p, value in summary.percentiles.items() if p != 50.0},
+                "outliers": f"{summary.n_low + summary.n_high:,}",
+                "pixels": f"{summary.n_valid:,}",
+            }
+            for name in _known(data)
+            for summary, error in [(data.summary(name), data.pixel_error(name))]
+        ],
     )
 
 
@@ -141,19 +151,6 @@ def _known(data: ReportData) -> list[str]:
     return [name for name in MAPS if data.has_values(name)]
 
 
-def _parameter_row(data: ReportData, name: str) -> Row:
-    summary, error = data.summary(name), data.pixel_error(name)
-    return {
-        "parameter": heading(name),
-        "median": measured(summary.median, summary.median_stderr),
-        "spread": short(summary.robust_sd),
-        f"error per {data.noun}": "not known" if error is None else short(error, 2),
-        **{f"{p:g} %": short(value, 4) for p, value in summary.percentiles.items() if p != 50.0},
-        "outliers": f"{summary.n_low + summary.n_high:,}",
-        "pixels": f"{summary.n_valid:,}",
-    }
-
-
 def _left_out(data: ReportData) -> str:
     flagged = int(data.flagged.sum())
     return f" {count(flagged, f'flagged {data.noun}')} excluded (see the table below)." if flagged else ""
@@ -184,20 +181,14 @@ def _flagged(data: ReportData) -> Table:
 def _channels(data: ReportData) -> Table | None:
     if data.shape[0] > 1 or data.shape[1] > 100:
         return None  # the maps of the store have them all
-    rows = [_channel_row(data, x) for x in range(data.shape[1])]
+    labels = [*data.channel_names, *[""] * data.shape[1]]
+    rows = [
+        {"channel": f"{x} {label}".strip()}
+        | {heading(name): measured(*data.estimate(name, 0, x)) for name in _known(data)}
+        | {"fit status": describe(int(data.status[0, x]))}
+        for x, label in enumerate(labels[: data.shape[1]])
+    ]
     return Table("channels", "Channels", "Estimates with their standard errors.", rows)
-
-
-def _channel_row(data: ReportData, x: int) -> Row:
-    label = data.channel_names[x] if x < len(data.channel_names) else ""
-    missing = np.full(data.shape, np.nan)
-    values = {
-        heading(name): measured(
-            float(data.maps[name][0, x]), float(data.maps.get(f"{name}_stderr", missing)[0, x])
-        )
-        for name in _known(data)
-    }
-    return {"channel": f"{x} {label}".strip(), **values, "fit status": describe(int(data.status[0, x]))}
 
 
 def _against_truth(data: ReportData) -> Table:
@@ -206,21 +197,19 @@ def _against_truth(data: ReportData) -> Table:
         "Estimates against the truth",
         "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 if estimates are unbiased, "
         f"scatter (standard deviation) 1 if errors are correct.{_left_out(data)}",
-        list(_truth_rows(data)),
+        [
+            {
+                "parameter": heading(name),
+                "true median": short(found.true_median, 4),
+                "estimated median": short(found.median, 4),
+                "RMSE": short(found.rmse),
+                "mean pull": measured(float(pull.mean()), n**-0.5) if n else "not known",
+                "scatter of pulls": measured(float(pull.std()), (2 * n) ** -0.5) if n else "not known",
+            }
+            for name, found in truth_errors(data).items()
+            for pull, n in [(found.pulls, found.pulls.size)]
+        ],
     )
-
-
-def _truth_rows(data: ReportData) -> Iterator[Row]:
-    for name, found in truth_errors(data).items():
-        pull, n = found.pulls, found.pulls.size
-        yield {
-            "parameter": heading(name),
-            "true median": short(found.true_median, 4),
-            "estimated median": short(found.median, 4),
-            "RMSE": short(found.rmse),
-            "mean pull": measured(float(pull.mean()), float(1 / np.sqrt(n))) if n else "not known",
-            "scatter of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
-        }
 
 
 #: RMSE of each prediction of the ensemble, and of the sampling noise beside them, to words and unit.
@@ -313,10 +302,7 @@ def _intervals(data: ReportData) -> Table:
             f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood "
             "interval from the estimate, in standard errors."
         )
-    return Table("uncertainties", "Uncertainties", words, list(_interval_rows(data)), "uncertainty")
-
-
-def _interval_rows(data: ReportData) -> Iterator[Row]:
+    rows = []
     for name in _known(data):
         error, summary = data.pixel_error(name, with_flagged=True), data.summary(name, with_flagged=True)
         if error is None:
@@ -337,42 +323,43 @@ def _interval_rows(data: ReportData) -> Iterator[Row]:
                 low, high = data.intervals[name]
                 ends = [short(float(np.nanmedian(part / errors))) for part in (values - low, high - values)]
             row |= dict(zip(("profile: below", "profile: above"), ends, strict=True))
-        yield row
+        rows.append(row)
+    return Table("uncertainties", "Uncertainties", words, rows, "uncertainty")
 
 
 def _samples(data: ReportData) -> Table | None:
-    if data.samples is None:
+    found, rows = data.samples, []
+    if found is None:
         return None
-    p = finite(data.samples.arrays.get("linearity_p", np.empty(0)))
+    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
+    for i, sample in enumerate(found.samples):
+        centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
+        residual = share = "–"
+        if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
+            rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
+            residual = measured(rest, rest_error)
+            if centre > 0:
+                share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
+        rows.append(
+            {
+                "sample": sample.name,
+                f"{words} ({unit})" if unit else words: "–" if sample.x is None else f"{sample.x:g}",
+                "frames": f"{sample.n_frames:,}",
+                "H (e⁻)": "0 (bias)" if sample.kind == "bias" else measured(centre, error),
+                "residual (e⁻)": residual,
+                "residual / H": share,
+            }
+        )
+    p = finite(found.arrays.get("linearity_p", np.empty(0)))
     off = percent(int((p < 0.01).sum()), p.size)
     remark = f" {off} of the {data.noun}s are off the line (p < 0.01; 1 % expected)." if p.size else ""
     return Table(
         "samples",
         "Samples",
         f"Medians over the {data.noun}s, with their standard errors.{remark}",
-        [_sample_row(data.samples, i) for i in range(len(data.samples.samples))],
+        rows,
         "exposures",
     )
-
-
-def _sample_row(found: Samples, i: int) -> Row:
-    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
-    sample = found.samples[i]
-    centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
-    residual = share = "–"
-    if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
-        rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
-        residual = measured(rest, rest_error)
-        if centre > 0:
-            share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
-    return {
-        "sample": sample.name,
-        f"{words} ({unit})" if unit else words: "–" if sample.x is None else f"{sample.x:g}",
-        "frames": f"{sample.n_frames:,}",
-        "H (e⁻)": "0 (bias)" if sample.kind == "bias" else measured(centre, error),
-        "residual (e⁻)": residual,
-        "residual / H": share,
-    }
 
 
 def _plan(data: ReportData) -> Table | None:
@@ -420,22 +407,23 @@ def _run(data: ReportData) -> Table:
 
 def _stages(data: ReportData) -> Table:
     words = "Wall time, CPU time and largest resident memory of a process."
-    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], "provenance")
 
+    def text(stage: Mapping[str, Any], key: str, words: str = "{}", unit: float | None = None) -> str:
+        value = stage.get(key)
+        return "" if value is None else words.format(value if unit is None else float(value) / unit)
 
-def _stage_row(stage: Mapping[str, Any]) -> Row:
-    def seconds(key: str) -> str:
-        return f"{float(stage[key]):.1f} s" if stage.get(key) is not None else ""
-
-    memory = stage.get("peak_memory_bytes")
-    return {
-        "stage": str(stage.get("stage", "")),
-        "state": str(stage.get("state", "")),
-        "wall": seconds("seconds"),
-        "CPU": seconds("cpu_seconds"),
-        "peak memory": f"{float(memory) / 2**20:.0f} MiB" if memory else "",
-        "started (UTC)": str(stage.get("started", "")),
-    }
+    rows = [
+        {
+            "stage": text(stage, "stage"),
+            "state": text(stage, "state"),
+            "wall": text(stage, "seconds", "{:.1f} s", 1.0),
+            "CPU": text(stage, "cpu_seconds", "{:.1f} s", 1.0),
+            "peak memory": text(stage, "peak_memory_bytes", "{:.0f} MiB", 2**20),
+            "started (UTC)": text(stage, "started"),
+        }
+        for stage in data.stages
+    ]
+    return Table("stages", "Stages", words, rows, "provenance")
 
 
 #: Files that are listed at most.

@@ -54,10 +54,12 @@ def robust_range(values: NDArray[Any] | Ordered) -> DisplayRange:
     bulk_low, bulk_high = known.quantiles([0.01, 0.99]).tolist()
     logarithmic = bulk_low > 0 and bulk_high / bulk_low > DECADES
     if logarithmic:
-        low, high = np.exp(_widened(np.log(bulk_low), np.log(bulk_high)))
+        bulk_low, bulk_high = np.log([bulk_low, bulk_high])
         smallest = max(smallest, float(np.finfo(np.float64).tiny))
-    else:
-        low, high = _widened(bulk_low, bulk_high)
+    margin = 0.3 * (bulk_high - bulk_low)
+    low, high = bulk_low - margin, bulk_high + margin
+    if logarithmic:
+        low, high = np.exp([low, high])
     low, high = max(float(low), smallest), min(float(high), largest)
     if not high > low:
         pad = max(abs(low) * 0.05, 1e-9)
@@ -65,11 +67,6 @@ def robust_range(values: NDArray[Any] | Ordered) -> DisplayRange:
     return DisplayRange(
         low, high, known.n_below(low) + known.n_above(high), known.n_missing, bool(logarithmic)
     )
-
-
-def _widened(low: float, high: float) -> tuple[float, float]:
-    margin = 0.3 * (high - low)
-    return low - margin, high + margin
 
 
 def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, most: int) -> FloatArray:

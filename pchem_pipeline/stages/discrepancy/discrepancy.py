@@ -36,6 +36,7 @@ from pchem_pipeline.run.stage import WHOLE, Named, StageContext
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.survey import mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
+    SURVEY,
     Survey,
     Window,
     choose_window,
@@ -150,9 +151,10 @@ class _Search:
                     "smaller errors raise discrepancy.clear_samples"
                 )
                 seen = scanned(few)
-            known = {"window": _amounts(few), "whole": _amounts(settings), **seen.numbers()}
+            known = SURVEY.dump_python(seen, mode="json")
+            known |= {"window": _amounts(few), "whole": _amounts(settings)}
             context.run_units([WHOLE], lambda *_: known, total=1)
-        self.seen = Survey.of_numbers(known)
+        self.seen = SURVEY.validate_python(known)
         few, most = (
             settings.model_copy(update=known.get(name, known["window"])) for name in ("window", "whole")
         )
@@ -210,7 +212,6 @@ class _Search:
             self.work += effort.spent
 
     def _taken(self, window: Window) -> dict[str, Any]:
-        """Return how the frames of a window were taken."""
         n_frames, *shape = self.source.shape
         known = tuple(place.region for place in self.seen.places.values())
         return {
@@ -222,7 +223,6 @@ class _Search:
 
 
 def _amounts(settings: DiscrepancySettings) -> dict[str, int]:
-    """Return the settings that the memory, or a clear disagreement, may lower."""
     names = ("max_samples", "max_pixels", "replicates", "extended_replicates")
     return {name: getattr(settings, name) for name in names}
 
@@ -266,7 +266,6 @@ def _samples(context: StageContext) -> list[SampleHistograms]:
 
 
 def _histograms(store: RunStore) -> SampleHistograms:
-    """Return the histograms of all pixels of a run."""
     if not store.has("histogram/counts"):
         place = quoted(store.path)
         raise StoreError(f"{_STAGE}: no histograms in the store; run: pchem histogram {place}")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pchem_pipeline.base.wording import count, fitted_or_chosen, percent, typeset
-from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats, sigma_text
+from pchem_pipeline.discrepancy.verdict import Place, Step, Verdict, micronats, sigma_text
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 _WIDTH = 100
@@ -97,18 +97,15 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         errors = "" if known else " (those without ± have no computed error)"
         lines += _wrapped(f"{step.likeliest}{place}: {', '.join(values)}{errors}")
     if step.effect:
-        lines += [line for other in step.rivals for line in _rejected(other)]
+        for other in step.rivals:
+            nats = -other.behind
+            lower = f" (log-likelihood lower by {nats:{',.0f' if nats >= 100.0 else '.2g'}})"
+            score, why = lower if math.isfinite(nats) else "", f"; {other.why}" if other.why else ""
+            lines += _wrapped(f"{other.effect} is rejected{score}{why}")
     elif found.verdict == "ambiguous":
         for rival, text in step.separate.items():
             lines += _wrapped(f"to distinguish {rival}: {text}")
     return lines
-
-
-def _rejected(rival: Rival) -> list[str]:
-    nats = -rival.behind
-    lower = f" (log-likelihood lower by {nats:{',.0f' if nats >= 100.0 else '.2g'}})"
-    score = lower if math.isfinite(nats) else ""
-    return _wrapped(f"{rival.effect} is rejected{score}{f'; {rival.why}' if rival.why else ''}")
 
 
 def _number(value: float, digits: int = 1) -> str:

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
@@ -33,16 +33,16 @@ from pchem_pipeline.model.arithmetic.significance import NO_CHANCE, SIGNIFICANCE
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
-from pchem_pipeline.stages.discrepancy.window import PAIRS, SHAPES, SUMS, Survey, frame_blocks
+from pchem_pipeline.stages.discrepancy.window import PAIRS, SHAPES, SUMS, Spot, Survey, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
 
-#: Codes of the tables of a band at most, and rows at least.
-_MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
-#: Bytes of a band for each code of a law, for each pixel, and for each sample that is looked at at once.
-_CODE_BYTES, _PIXEL_BYTES, _SAMPLE_BYTES = 20, 800, 28
+#: Codes of the tables of a band at most.
+_MOST_CODES = 1 << 26
+#: Bytes of a band for each sample that is looked at at once.
+_SAMPLE_BYTES = 28
 #: Such samples at most.
 _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
@@ -66,7 +66,8 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
         memory = None if limit is None else (limit << 20) - resident_bytes()
         here, more = places_of_bands(store, source, plain=not model.effects, memory=memory, left_out=left_out)
         places, shares = (places or {}) | here, shares | more
-    return Survey(places or {}, shares, tuple(left_out.tolist()), tuple(odd["copied"].tolist()))
+    spots = {name: Spot(each.region, each.p) for name, each in (places or {}).items()}
+    return Survey(spots, shares, tuple(left_out.tolist()), tuple(odd["copied"].tolist()))
 
 
 def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, Suspect] | None:
@@ -100,8 +101,10 @@ def places_of_bands(
     places: dict[str, Suspect] = {}
     for first, last in bands:
         fitted, laws = _laws(store, (first, last))
-        for name, values in _shapes(laws, fitted.usable.shape).items():
-            maps[name].add(values, first)
+        shapes = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
+        shapes["goodness"] = goodness_of(laws.moments["goodness"])
+        for name, values in shapes.items():
+            maps[name].add(np.where(laws.good, values, np.nan).reshape(last - first, nx), first)
         if not laws.good.any():
             continue
         blocks = partial(frame_blocks, source, numbers, (first, last))
@@ -134,12 +137,12 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
     """Return the rows of a band, and the samples of its frames looked at at once, within a memory, bytes."""
     ny, nx = shape
     counts = store.array("histogram/counts")
-    fewest = min(ny, _FEWEST_ROWS)
+    fewest = min(ny, 8)
     rows = max(fewest, min(ny, _MOST_CODES // (nx * counts.shape[2])))
     if memory is None:
         return rows, _MOST_AT_ONCE
-    codes = mean_codes(store)
-    pixel = counts.shape[2] * counts.dtype.itemsize + codes * _CODE_BYTES + _PIXEL_BYTES + _SAMPLE_BYTES
+    # bytes for each code of a law, and for each pixel
+    pixel = counts.shape[2] * counts.dtype.itemsize + 20 * mean_codes(store) + 800 + _SAMPLE_BYTES
     left = 0
     for lower in range(rows, fewest - 1, -1):
         left = memory - pairs_bytes((lower, nx))
@@ -182,10 +185,3 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     seen = PixelHistograms(counts.reshape(-1, counts.shape[2]), origin, beyond)
     laws = pixel_laws(seen, maps.columns, usable.ravel())
     return replace(maps, usable=laws.good.reshape(usable.shape)), laws
-
-
-def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
-    """Return the scores and the goodness of fit of each pixel, NaN without a law."""
-    found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
-    found["goodness"] = goodness_of(laws.moments["goodness"])
-    return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}

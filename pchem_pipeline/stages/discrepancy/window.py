@@ -9,17 +9,16 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.families import box_sums, cumulative
 from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
@@ -30,8 +29,6 @@ from pchem_pipeline.frames.stream import FrameSource, FrameStream
 #: Bytes of a search: with its program and kernels, however small the window; of a sample; of a pixel, and of
 #: each code of its law. Measured with one worker, 256 to 8190 pixels and 1000 to 6000 frames.
 _PROGRAM_BYTES, _SAMPLE_BYTES, _PIXEL_BYTES, _CODE_BYTES = 290 << 20, 8, 12 << 10, 75
-#: Pixels that a window has at least, and the steps in which it is made smaller.
-_FEWEST_PIXELS, _SMALLER = 256, 0.9
 #: Standard deviations of the largest statistic. Some poor sensors have as many without any effect (of 60 of
 #: all kinds none more than 20), as without simulations their statistics are not quite standard normal: of
 #: these less is compared, with simulations that tell.
@@ -46,45 +43,21 @@ SUMS, SHAPES, PAIRS = (
 
 
 @dataclass(frozen=True)
+class Spot:
+    """A part of the sensor that stands out, and its p-value."""
+
+    region: Region
+    p: float
+
+
+@dataclass(frozen=True)
 class Survey:
-    """What stands out, and how much was looked at.
+    """What stands out, and how much was looked at."""
 
-    Attributes:
-        places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
-        shares: of the run's samples, by what was looked at; what is absent was not.
-        left_out: frames that are empty, copies, far from the others or moved: nothing is said of them.
-        copied: those of them that are copies of earlier ones.
-    """
-
-    places: Mapping[str, Suspect] = field(default_factory=dict)
-    shares: Mapping[str, float] = field(default_factory=dict)
-    left_out: tuple[int, ...] = ()
-    copied: tuple[int, ...] = ()
-
-    def numbers(self) -> dict[str, Any]:
-        """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
-        places = {
-            name: {"region": at.region.numbers(), "p": at.p, "inside": at.inside, "outside": at.outside}
-            for name, at in self.places.items()
-        }
-        frames = {"left_out": list(self.left_out), "copied": list(self.copied)}
-        return {"places": places, "shares": dict(self.shares), **frames}
-
-    @classmethod
-    def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
-        """Return it as :meth:`numbers` gave it, its places without family and z."""
-        places = {
-            name: Suspect(
-                family="",
-                z=0.0,
-                log_p=math.log(each["p"]),
-                inside=each["inside"],
-                outside=each["outside"],
-                region=Region.model_validate(each["region"]),
-            )
-            for name, each in numbers["places"].items()
-        }
-        return cls(places, numbers["shares"], tuple(numbers["left_out"]), tuple(numbers["copied"]))
+    places: Mapping[str, Spot] = field(default_factory=dict)  # of each map (next_x, score.C2) the worst
+    shares: Mapping[str, float] = field(default_factory=dict)  # of the run's samples, by what was looked at
+    left_out: tuple[int, ...] = ()  # empty, copied, outlying or moved frames: nothing is said of them
+    copied: tuple[int, ...] = ()  # those of them that are copies of earlier ones
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
         """Return the verdict with this survey, and the share of the samples that was compared."""
@@ -103,6 +76,10 @@ class Survey:
             }
         )
         return verdict.model_copy(update={"examined": examined})
+
+
+#: To and from JSON data, for a marker.
+SURVEY = TypeAdapter(Survey)
 
 
 @dataclass(frozen=True)
@@ -212,8 +189,8 @@ def within_memory(
     """
     window = choose_window(shape, settings, roi)
     while (least := search_bytes(window, codes)) > limit:
-        pixels = int(window.pixels * _SMALLER)
-        if pixels < _FEWEST_PIXELS:
+        pixels = int(window.pixels * 0.9)
+        if pixels < 256:
             raise ConfigError(
                 f"discrepancy needs at least {-(-least >> 20)} MiB, compute.max_memory (--max-memory) allows "
                 f"{limit >> 20}; raise it"

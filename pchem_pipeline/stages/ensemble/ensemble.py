@@ -58,28 +58,17 @@ _HISTOGRAM = ("origin", "minimum", "maximum")
 
 @dataclass(frozen=True)
 class _Job:
-    """What the ensemble is of.
-
-    Attributes:
-        tiles: number and place of each tile by its key.
-        frames: the chosen frames (first, end), or None where there are none to choose from.
-        codes: by tile the samples of all frames, where the fit has counted them; see `code_sums`.
-        source: where frames come from, if any are read.
-        truth: first row, first column and first frame of the input in the true electron numbers, or None.
-        effects: with which the maps were fitted.
-        limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
-    """
+    """What the ensemble is of."""
 
     config: RunConfig
     sensor: SensorInfo
     axes: EnsembleAxes
-    tiles: dict[str, tuple[int, Tile]]
-    frames: tuple[int, int] | None
-    codes: dict[str, dict[str, Any]]
-    source: FrameSource | None
-    truth: tuple[int, int, int] | None
-    effects: tuple[Effect, ...]
-    limits: tuple[int, int] | None
+    tiles: dict[str, tuple[int, Tile]]  # number and place of each by its key
+    frames: tuple[int, int] | None  # the chosen ones (first, end); None where there are none to choose from
+    source: FrameSource | None  # where frames come from, if any are read
+    truth: tuple[int, int, int] | None  # row, column and frame of the input in the true electron numbers
+    effects: tuple[Effect, ...]  # with which the maps were fitted
+    limits: tuple[int, int] | None  # codes of the ADC, DN, where samples lie at one of them
 
 
 @dataclass(frozen=True)
@@ -149,8 +138,7 @@ def run(context: StageContext) -> None:
         return
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
-    codes = {} if frames is None or everything else _codes(context)
-    job = _Job(context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits)
+    job = _Job(context.config, sensor, axes, numbered, frames, source, truth, effects, limits)
     rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -168,13 +156,6 @@ def run(context: StageContext) -> None:
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
         totals = _totals(store, job, [numbered[tile.key][0] for tile in finished])
         _write_result(store, totals, fitted, job, made)
-
-
-def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
-    """Return the samples of each code that the fit counted, by tile."""
-    record = context.store.records.read("fit")
-    made = {} if record is None else context.store.records.summaries("fit", record.fingerprint)
-    return {key: summary["codes"] for key, summary in made.items() if "codes" in summary}
 
 
 def _chosen_frames(sensor: SensorInfo, settings: EnsembleSettings) -> tuple[int, int] | None:
@@ -238,7 +219,6 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
 
 
 def _in_band(tile: Tile, band: Band | Tile) -> tuple[slice, slice]:
-    """Return the index of a tile's pixels in its band."""
     return slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)
 
 
@@ -249,12 +229,7 @@ def _sum_tile(
     fit, histogram = (store.at(tile.region, group) for group in ("fit", "histogram"))
     maps = [fit[name] for name in PARAMETERS]
     origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
-    codes = None if chosen is None else job.codes.get(tile.key)
-    if codes is None:
-        counted = PixelHistograms(histogram["counts"], origin, histogram["under"] + histogram["over"])
-    else:  # only the number of the samples matters
-        outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
-        counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
+    counted = PixelHistograms(histogram["counts"], origin, histogram["under"] + histogram["over"])
     errors = _errors(fit, tile, job.sensor.shape)
     numbers = np.arange(origin.size).reshape(origin.shape)  # of the pixels, in C order
     rows = []
@@ -273,22 +248,7 @@ def _sum_tile(
         )
         rows.append(row)
     integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
-    if codes is not None:
-        samples, beyond = on_axis(codes, job.axes.dn)
-        integers[job.axes.integers["counts_all"]] = samples
-        integers[job.axes.integers["outside_all"]] = beyond
-        floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
-
-
-def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[IntArray, int]:
-    """Return the samples at each DN of an axis, and those beyond it; see `code_sums`."""
-    place = np.array(content["dn"], np.int64) - axis.start
-    samples = np.array(content["samples"], np.int64)
-    inside = (place >= 0) & (place < axis.size)
-    found = np.zeros(axis.size, np.int64)
-    found[place[inside]] = samples[inside]
-    return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
 def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | None:
@@ -303,7 +263,6 @@ def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | No
 
 
 def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:
-    """Open the stream of the frames of a band."""
     assert job.source is not None
     return FrameStream(job.source, [(band.y0, band.y1)], FRAMES_AT_ONCE, frames=frames)
 
@@ -328,7 +287,6 @@ def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
 
 
 def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, tuple[IntArray, int]]:
-    """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
     assert job.frames is not None
@@ -355,7 +313,6 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, tuple[I
 
 
 def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
-    """Add the rows of the finished tiles; without frames every pixel counts the same."""
     samples = (1, 1)
     if job.frames is not None:
         gone, (first, end) = uncounted_frames(odd_frames_of(store)[0]), job.frames
@@ -386,7 +343,22 @@ def _write_result(
         with np.errstate(divide="ignore"):  # one whose H, or gain, is more open may be off by any number
             wide = np.minimum(2.0 * pixels.maps[0] ** 2 / per_pixel, 0.5 / gap) > 0.25
         weight = bias_weight(np.where(wide | (words & int(flags_of("conversion_gain")) != 0), 0.0, gap))
-    true = _true_pixels(store, job, fitted.place)
+    true, simulated = None, job.config.simulate
+    if job.truth is not None and simulated is not None and not simulated.effects:
+        # of the pixels with a value, if they are all that made the frames
+        (y0, x0, _), (ny, nx) = job.truth, job.sensor.shape
+        truth = store.at((slice(y0, y0 + ny), slice(x0, x0 + nx)), "truth")
+        of_truth, known = UsablePixels.from_maps([truth[name][fitted.place] for name in PARAMETERS])
+        true = of_truth if known.all() else None
+    missing: dict[str, str] = {}
+    if frames is None:
+        missing["frames"] = f"input is {job.sensor.kind}: the ensemble has all samples"
+    if totals.count("compared") == 0:
+        missing["truth"] = (
+            "unknown true electron numbers"
+            if simulated is None
+            else "no true electron numbers stored for these frames"
+        )
     arrays, found = curves(totals, pixels, settings, job.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
     arrays |= numbers | components(pixels, numbers["electron_pmf"], weight)
@@ -403,36 +375,10 @@ def _write_result(
             totals, pixels, per_pixel, weight, extended=bool(job.effects) or job.limits is not None
         ),
         "component_cases": COMPONENT_CASES,
-        "missing": _missing(job, totals),
+        "missing": missing,
     }
     if job.effects:
         found["model"] = model_words(job.effects)
     for name, values in arrays.items():
         store.write_array(f"ensemble/{name}", values)
     store.set_attributes("ensemble", plain(found | facts))
-
-
-def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels | None:
-    """Return the true parameters of the pixels with a value, if they are all that made the frames."""
-    simulated = job.config.simulate
-    if job.truth is None or simulated is None or simulated.effects:
-        return None
-    y0, x0, _ = job.truth
-    ny, nx = job.sensor.shape
-    truth = store.at((slice(y0, y0 + ny), slice(x0, x0 + nx)), "truth")
-    true, known = UsablePixels.from_maps([truth[name][place] for name in PARAMETERS])
-    return true if known.all() else None
-
-
-def _missing(job: _Job, totals: EnsembleTotals) -> dict[str, str]:
-    """Say which parts of the ensemble this run does not have, and why."""
-    missing: dict[str, str] = {}
-    if job.frames is None:
-        missing["frames"] = f"input is {job.sensor.kind}: the ensemble has all samples"
-    if totals.count("compared") == 0:
-        missing["truth"] = (
-            "unknown true electron numbers"
-            if job.config.simulate is None
-            else "no true electron numbers stored for these frames"
-        )
-    return missing

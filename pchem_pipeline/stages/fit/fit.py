@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.expected_information import (
@@ -21,7 +21,6 @@ from pchem_pipeline.model.errors.expected_information import (
     biased_by_rounding,
 )
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, moves_gain
-from pchem_pipeline.model.law.parameters import usable_pixels
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
@@ -37,7 +36,6 @@ from pchem_pipeline.store.tiles import Tile, equal_rows
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
-_LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 
 
 def run(context: StageContext) -> None:
@@ -105,7 +103,7 @@ def _create(context: StageContext, how: TileFit, dtype: np.dtype[Any]) -> None:
 def _do_tile(
     tile: Tile, store: RunStore, *, samples: Sequence[Path], how: TileFit, model: ModelVersion
 ) -> dict[str, Any]:
-    """Fit one tile of the store; the summary counts its pixels, and the samples of each code.
+    """Fit one tile of the store; the summary counts its pixels.
 
     ``samples`` are the paths of the runs of several samples; empty for a run of one.
     """
@@ -134,7 +132,11 @@ def _do_tile(
                 whole[variable.index(part)] = values
     for each in runs:
         if each.has("frames/excluded"):
-            _leave_out(arrays, each.read("frames/excluded", tile.region) != 0)
+            excluded = each.read("frames/excluded", tile.region) != 0
+            for path, values in arrays.items():
+                if values.dtype.kind == "f":
+                    values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
+            arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
     store.at(tile.region).update(arrays)
     words = arrays["fit/fit_status"]
     summary: dict[str, Any] = {
@@ -144,42 +146,11 @@ def _do_tile(
     if samples:
         return {**summary, "poor": int(np.count_nonzero(words & np.uint16(int(FitStatus.POOR_FIT))))}
     maps = [arrays[f"fit/{name}"] for name in PARAMETERS]
-    summary["codes"] = code_sums(histograms[0], maps)
     if how.settings.likelihood == "density" and not how.effects:
         frames = histograms[0]["counts"].sum(axis=2, dtype=np.float64)
         biased = biased_by_rounding([values.ravel() for values in maps], frames.ravel())
         summary["rounded"] = int(np.count_nonzero(biased))
     return summary
-
-
-def _leave_out(arrays: Arrays, excluded: BoolArray) -> None:
-    """Take the values of excluded pixels (y, x) out of the arrays of a tile, and give them their word."""
-    for path, values in arrays.items():
-        if values.dtype.kind == "f":
-            values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
-    arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
-
-
-def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]:
-    """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
-
-    These are the codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
-    The ensemble compares all frames with the model, and would decode every histogram again for it. Histogram
-    as of `fit_tile`; maps are (H, g, mu, sigma), (y, x) each, NaN without a value.
-    """
-    usable, counts, origin = usable_pixels(*maps), histogram["counts"], histogram["origin"]
-    start = int(origin.min())
-    samples = np.zeros(int(origin.max()) - start + counts.shape[2], np.int64)
-    for first in np.unique(origin[usable]):  # few: windows begin at round numbers
-        place = int(first) - start
-        some = counts[usable & (origin == first)].sum(axis=0, dtype=np.int64)
-        samples[place : place + some.size] += some
-    occupied = np.flatnonzero(samples)
-    return {
-        "dn": (start + occupied).tolist(),
-        "samples": samples[occupied].tolist(),
-        "outside": sum(int(histogram[name][usable].sum(dtype=np.int64)) for name in ("under", "over")),
-    }
 
 
 # -- what all pixels of the sensor together say about the fit of each ------------------------------
@@ -197,14 +168,10 @@ def judge_sensor(context: StageContext) -> int:
     store, shape = context.store, context.sensor.shape
     bands = [(slice(*rows), slice(0, shape[1])) for rows in equal_rows(shape[0], context.tile[0])]
     every = -(-shape[0] * shape[1] // _LARGEST_POOL)
-    kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
     chosen = []
     for band in bands:
-        pixels = _judged(store, band)
-        some = pixels.of(slice(-band[0].start * shape[1] % every, None, every))
+        some = _judged(store, band).of(slice(-band[0].start * shape[1] % every, None, every))
         chosen.append(Judged.join([some]))  # a copy: a view would keep the whole band
-        if shape[0] * shape[1] <= _LARGEST_KEPT:
-            kept[band[0].start] = pixels
     pool = NoisePool.of(Judged.join(chosen))
     weakly, unsure = (np.uint16(int(bit)) for bit in (FitStatus.WEAKLY_IDENTIFIED, FitStatus.BIAS_UNSURE))
     found = 0
@@ -212,7 +179,7 @@ def judge_sensor(context: StageContext) -> int:
         words = store.read("fit/fit_status", band)
         new = words & ~(weakly | unsure)
         if pool is not None:
-            pixels = kept[band[0].start] if kept else _judged(store, band)
+            pixels = _judged(store, band)
             weak, ambiguous = pool.reasons(pixels, context.config.fit)
             exposure = store.read("fit/quanta_exposure", band).ravel()
             of_gain = bool(context.sensor.samples) | moves_gain(exposure, pixels.noise)

@@ -30,22 +30,14 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 @dataclass(frozen=True)
 class TileFit:
-    """How the pixels of a tile are fitted.
-
-    Attributes:
-        adc_limits: first and last code of the ADC, DN, or None where they are not known.
-        effects: of the run's model; the plain fit is where the one under their law starts.
-        set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
-        bias: of several samples, which hold no electrons; empty for one sample.
-        shown: the sample whose H is in ``fit``.
-    """
+    """How the pixels of a tile are fitted."""
 
     settings: FitSettings = field(default_factory=FitSettings)
-    adc_limits: tuple[int, int] | None = None
-    effects: Sequence[Effect] = ()
-    set_aside: Sequence[Interval] = ()
-    bias: Sequence[bool] = ()
-    shown: int = 0
+    adc_limits: tuple[int, int] | None = None  # first and last code of the ADC, DN; None: not known
+    effects: Sequence[Effect] = ()  # of the run's model; the plain fit is where that under their law starts
+    set_aside: Sequence[Interval] = ()  # codes that are left out, e- on the comb of the fit with the PCD
+    bias: Sequence[bool] = ()  # of several samples, which hold no electrons; empty for one sample
+    shown: int = 0  # the sample whose H is in ``fit``
 
 
 def fit_tile(

@@ -22,23 +22,19 @@ COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covarianc
 _COLUMN_FRAMES = 1024
 _ROW_FRAMES = 4096
 _CHUNK_BLOCKS = 8
-#: a chunk of row sums of all rows is read at once in the end: fewer frames on tall sensors
-_ROWS_AT_ONCE = 2048
-#: rows and columns of pixels that are decoded to read the histogram of one, where tiles are larger than a few
-_READ_ROWS, _READ_COLUMNS, _FEW_PIXELS = 16, 64, 4096
 
 
 def row_frames(ny: int) -> int:
-    """Return the frames in a chunk of row sums."""
-    return max(_ROW_FRAMES // 16, _ROW_FRAMES // -(-ny // _ROWS_AT_ONCE))
+    """Return the frames in a chunk of row sums, fewer on tall sensors: one of all rows is read at once."""
+    return max(_ROW_FRAMES // 16, _ROW_FRAMES // -(-ny // 2048))
 
 
 def create_counts(context: StageContext, bins: int, dtype: Any) -> None:
     """Make the arrays of the histograms; counts are a file for each tile, of pieces that are read alone."""
     tile = tuple(min(size, length) for size, length in zip(context.tile, context.sensor.shape, strict=True))
     chunks, shards = {}, None
-    if math.prod(tile) > _FEW_PIXELS:
-        chunks = {"y": _part(tile[0], _READ_ROWS), "x": _part(tile[1], _READ_COLUMNS)}
+    if math.prod(tile) > 4096:  # else all are decoded to read the histogram of one
+        chunks = {"y": _part(tile[0], 16), "x": _part(tile[1], 64)}
         shards = (*tile, bins)
     context.create("histogram/counts", lengths={"bin": bins}, chunks=chunks, shards=shards, dtype=dtype)
     context.create(*(f"histogram/{name}" for name in MAPS))

@@ -210,7 +210,6 @@ class _BandCounter:
             self._along(name).add(part[None])
 
     def _along(self, name: str) -> _AlongTime:
-        """Return what gathers an array along time."""
         if name not in self._series:
             rows = self._groups if name == "column_sum" else self._rows
             self._series[name] = _AlongTime(self._store, f"summary/{name}", rows, self._done[name])

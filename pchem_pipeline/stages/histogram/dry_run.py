@@ -19,9 +19,6 @@ from pchem_pipeline.stages.histogram.histogram import bins_of
 from pchem_pipeline.stages.ingest import disk_words
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
-#: the program with what the later stages hold, and that for each pixel
-_REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
-
 
 class Plan(NamedTuple):
     """What a run from camera files to the report takes."""
@@ -60,7 +57,8 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     )
     single_pass = whole <= allowed
     bands = BASE_BYTES + min(whole - BASE_BYTES, workers * band_bytes(config, workers))
-    held = max(whole if single_pass else bands, _REPORT_BYTES + _REPORT_PIXEL_BYTES * ny * nx)
+    later = (400 << 20) + 400 * ny * nx  # what the later stages hold, with the program
+    held = max(whole if single_pass else bands, later)
     tiles, (rows, columns) = len(tile_grid((ny, nx), config.run.tile)), tile_shape(config.run.tile, (ny, nx))
     how = "" if single_pass else "; read twice, in bands of rows (once with more compute.max_memory)"
     lines = [

@@ -33,24 +33,6 @@ from pchem_pipeline.store.tiles import Tile, equal_rows
 # -- the stage ----------------------------------------------------------------------------------
 
 
-def _bands(context: StageContext, source: FrameSource, bins: int) -> tuple[list[Band], int]:
-    """Return the bands and the bytes of the highest; say so where that is more memory than allowed."""
-    settings, tiles = context.config.histogram, context.tiles()
-    n_frames, _, columns = source.shape
-    row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
-    most = context.band_bytes // row
-    pending = {tile.key for tile in context.pending(tiles)}
-    bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
-    highest = max(band.y1 - band.y0 for band in bands)
-    if highest > most:
-        context.note(
-            f"{highest} rows of {columns} pixels, the minimum for a worker, need "
-            f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory or compute.max_memory "
-            "allow; lower histogram.window_frames, or --workers"
-        )
-    return bands, highest * row
-
-
 def run(context: StageContext) -> None:
     """Make histograms and summaries of all chosen tiles.
 
@@ -71,17 +53,28 @@ def run(context: StageContext) -> None:
     else:
         bins = context.store.array("histogram/counts").shape[2]
     create_arrays(context, source.shape, bins)
-    bands, held = _bands(context, source, bins)
-    job = CountJob(context.store.path, source.shape, bins, context.config.histogram)
+    settings, tiles = context.config.histogram, context.tiles()
+    n_frames, _, columns = source.shape
+    row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
+    most = context.band_bytes // row
+    pending = {tile.key for tile in context.pending(tiles)}
+    bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
+    highest = max(band.y1 - band.y0 for band in bands)
+    if highest > most:
+        context.note(
+            f"{highest} rows of {columns} pixels, the minimum for a worker, need "
+            f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory or compute.max_memory "
+            "allow; lower histogram.window_frames, or --workers"
+        )
+    job = CountJob(context.store.path, source.shape, bins, settings)
     threads = max(1, context.executor.workers // max(1, len(context.pending(bands))))
     task = functools.partial(_do_band, job=job, source=source, threads=threads)
-    done = context.run_units(bands, task, unit_name="band", unit_bytes=held)
+    done = context.run_units(bands, task, unit_name="band", unit_bytes=highest * row)
     if len(done) == context.n_keys:
         _end(context)
 
 
 def _end(context: StageContext) -> None:
-    """Do what needs the whole sensor."""
     if context.config.histogram.summaries:
         _write_frame_statistics(context)
     number = 0
@@ -95,7 +88,6 @@ def _end(context: StageContext) -> None:
 
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:
-    """Return the number of bins of the sensor, from its first frames."""
     settings, (n_frames, ny, columns) = context.config.histogram, source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
     most, together = max(ROW_GROUP, context.band_bytes // row), min(source.rows_per_read, ny)
@@ -116,7 +108,6 @@ def bins_of(source: FrameSource, frames: int, most: int, rows: int) -> int:
 
 
 def _do_band(band: Band, store: RunStore, *, job: CountJob, source: FrameSource, threads: int) -> None:
-    """Count a band and write its chunks."""
     rows = [(band.y0, band.y1)]
     with FrameStream(source, rows, job.settings.window_frames, threads=threads) as stream:
         StackCounter(job, rows).count(stream)

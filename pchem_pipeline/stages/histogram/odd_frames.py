@@ -95,7 +95,6 @@ def _samples(source: FrameSource, tile: Tile, frames: Iterable[int]) -> Iterator
 
 
 def _leave_out_of_spectrum(context: StageContext, out: IntArray) -> None:
-    """Compute the spectrum of the first frames without those that are left out."""
     source, rows = open_source(context), (0, min(context.sensor.shape[0], ROW_GROUP))
     spectrum = FrameSpectrum((rows[1], source.shape[2]))
     frames, step = (0, min(spectrum.most, source.shape[0])), context.config.histogram.window_frames

@@ -56,7 +56,11 @@ def count_in_one_pass(context: StageContext) -> None:
     if not _is_wanted(context):
         return
     frames = open_frames(context.config.input, context.base_dir)
-    if not _blocks_are_chunks(context, frames) or not _fits(context, frames, 0):
+    n_frames, block = frames.shape[0], context.config.histogram.window_frames
+    chunk = ingest.chunk_shape(frames.shape, frames.dtype.itemsize)[0]
+    # blocks of the stream are whole chunks of the copy, where there is one
+    chunked = context.config.input.mode == "reference" or block >= n_frames or block % chunk == 0
+    if not chunked or not _fits(context, frames, 0):
         return
     paths = input_paths(context.config.input, context.base_dir)
     quick = quick_identity(paths)
@@ -113,15 +117,7 @@ def _is_wanted(context: StageContext) -> bool:
     )
 
 
-def _blocks_are_chunks(context: StageContext, frames: FrameSequence) -> bool:
-    """Return whether the blocks of the stream are whole chunks of the copy, where there is one."""
-    block = min(context.config.histogram.window_frames, frames.shape[0])
-    chunk = ingest.chunk_shape(frames.shape, frames.dtype.itemsize)[0]
-    return context.config.input.mode == "reference" or block == frames.shape[0] or block % chunk == 0
-
-
 def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
-    """Return whether the memory allowed is enough."""
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
     return need <= allowed_bytes(context.config, context.config.compute.count())
 
@@ -147,7 +143,6 @@ def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStre
 
 
 def _create(context: StageContext, frames: FrameSequence, bins: int) -> None:
-    """Make the arrays of both stages anew."""
     context.fresh = True
     for name in (path for stage in PREPARED for path in STAGES[stage].writes):
         context.store.delete(name)

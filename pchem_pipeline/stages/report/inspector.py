@@ -99,7 +99,6 @@ def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[MapEntry]:
 
 
 def _entry(variable: Variable) -> MapEntry:
-    """Return the words of a stored map."""
     # the sentences of these groups begin with the name of the quantity, those of others explain it
     named = variable.group in ("maps", "truth")
     label = variable.long_name.split(":")[0] if named else variable.name.replace("_", " ")

@@ -75,7 +75,6 @@ def run(context: StageContext) -> None:
 def _write(
     unit: Unit, store: RunStore, *, config: RunConfig, stages: list[dict[str, Any]], draw: DrawAll
 ) -> dict[str, Any]:
-    """Gather, draw and write."""
     with beside(_workers(config.compute)) as hand:
         data = gather(store, config, stages, hand)
         files = render_report(data, draw)
@@ -83,18 +82,14 @@ def _write(
         store.write_file(name, text.encode())
     if DISCREPANCY_PAGE not in files:
         (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
-    return {"warnings": _warnings(data)}
-
-
-def _warnings(data: ReportData) -> list[str]:
-    """Return what the quick look found that is more than a remark, for the terminal."""
     look = data.quick_look
     if look is None or data.discrepancy is not None:
-        return []
+        return {}
+    # what is more than a remark is told in the terminal, too
     found = [check_sentence(check) for check in look.found if check.level in ("caution", "serious")]
-    if not found or look.found[0].name == "levels":
-        return found
-    return [*found, f"to look closer: {look.command}"]
+    if found and look.found[0].name != "levels":
+        found.append(f"to look closer: {look.command}")
+    return {"warnings": found}
 
 
 def gather(
@@ -144,7 +139,6 @@ def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> tuple[list[P
 
 
 def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
-    """Return the pixels that stand for the sensor."""
     data, names = run.data, run.sensor.names
     if asked:
         return [("", y, x) for y, x in asked]
@@ -154,7 +148,6 @@ def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
 
 
 def _inspector(run: StoredRun, sample: PixelSample, threads: int) -> InspectorData:
-    """Pack maps for the inspector, and add their values to the pixels that are held in full."""
     data = run.data
     read = {f"maps/{name}": values for name, values in data.maps.items()}
     read |= {f"fit/{name}": data.fit[name] for name in ("fit_status", "outlier_share") if name in data.fit}
@@ -163,7 +156,6 @@ def _inspector(run: StoredRun, sample: PixelSample, threads: int) -> InspectorDa
 
 
 def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
-    """Return what the table of stages shows, the report itself left out."""
     records, rows = context.store.records, []
     for record in (records.read(name) for name in pipeline() if name != context.stage):
         if record is not None:
@@ -182,7 +174,6 @@ def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
 
 
 def _workers(settings: ComputeSettings) -> int:
-    """Return how many may work on a report at a time."""
     workers = settings.count()
     if settings.max_memory is not None:
         workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))

@@ -191,9 +191,15 @@ def samples_of(sensor: SensorInfo, arrays: Arrays, config: RunConfig) -> Samples
 
 
 def _run_facts(store: RunStore, sensor: SensorInfo, model: FittedModel, config: RunConfig) -> dict[str, Any]:
+    text = "ready-made histograms"
+    if sensor.samples:
+        shown = sensor.samples[sensor.shown].name
+        text = f"{len(sensor.samples)} samples; maps and ensemble show {shown}"
+    elif sensor.kind == "frames":
+        text = f"frames, {sensor.mode}" + (f", read as {sensor.reader}" if sensor.reader else "")
     facts: dict[str, Any] = {
         "store": store.path.name,
-        "input": _input_text(sensor),
+        "input": text,
         "type of the data": sensor.dtype,
         "bit depth": sensor.bit_depth,
         "digest of the input": sensor.identity.get("digest", ""),
@@ -210,16 +216,7 @@ def _run_facts(store: RunStore, sensor: SensorInfo, model: FittedModel, config: 
     return facts
 
 
-def _input_text(sensor: SensorInfo) -> str:
-    if sensor.samples:
-        return f"{len(sensor.samples)} samples; maps and ensemble show {sensor.samples[sensor.shown].name}"
-    if sensor.kind != "frames":
-        return "ready-made histograms"
-    return f"frames, {sensor.mode}" + (f", read as {sensor.reader}" if sensor.reader else "")
-
-
 def _missing(name: str, sensor: SensorInfo, maps: Arrays, ensemble: Arrays, compared: bool) -> dict[str, str]:
-    """Say why parts are left out."""
     found: dict[str, str] = {}
     if not {*CHARGE_RATES, "charge_per_level"} & maps.keys():
         found["charge_rate"] = "no charge rate: input.against is none" if sensor.samples else NO_TIME

@@ -14,7 +14,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.stages.samples import OpenSample, _same_sensor
+from pchem_pipeline.stages.samples import OpenSample, same_sensor
 
 
 def sample(name, serial=None, file="one", setup=None, **settings):
@@ -31,16 +31,16 @@ def sample(name, serial=None, file="one", setup=None, **settings):
 def test_exposures_of_two_cameras_are_refused():
     first = sample("sample a.yaml", "A1", "other")
     with pytest.raises(ConfigError, match=r"b\.yaml: serial number B2, but sample a\.yaml has A1;"):
-        _same_sensor([first], sample("sample b.yaml", "B2"))
+        same_sensor([first, sample("sample b.yaml", "B2")])
     for serial in ("A1", None):
-        _same_sensor([first], sample("sample b.yaml", serial))
+        same_sensor([first, sample("sample b.yaml", serial)])
 
 
 def test_exposures_of_two_settings_are_refused_and_of_two_image_types_not():
     first = sample("sample a.yaml", None, "other", {"READMODE": "quiet", "IMAGETYP": "flat"})
     with pytest.raises(ConfigError, match=r"b\.yaml: READMODE = fast, but sample a\.yaml has quiet;"):
-        _same_sensor([first], sample("sample b.yaml", setup={"READMODE": "fast", "IMAGETYP": "flat"}))
-    _same_sensor([first], sample("sample b.yaml", setup={"READMODE": "quiet", "IMAGETYP": "dark"}))
+        same_sensor([first, sample("sample b.yaml", setup={"READMODE": "fast", "IMAGETYP": "flat"})])
+    same_sensor([first, sample("sample b.yaml", setup={"READMODE": "quiet", "IMAGETYP": "dark"})])
 
 
 @pytest.mark.parametrize(
@@ -53,13 +53,13 @@ def test_exposures_of_two_settings_are_refused_and_of_two_image_types_not():
 )
 def test_exposures_in_one_file_are_told_apart(one, other):
     """Two datasets of an HDF5 file, or two ranges of frames of one stack."""
-    _same_sensor([sample("a", **one)], sample("b", **other))
+    same_sensor([sample("a", **one), sample("b", **other)])
     with pytest.raises(ConfigError, match="b has the same frames as a; list each sample once"):
-        _same_sensor([sample("a", **one)], sample("b", **one))
+        same_sensor([sample("a", **one), sample("b", **one)])
     # ranges that overlap hold the same frames
     for taken in ((200, 600), None):
         with pytest.raises(ConfigError, match="has the same frames"):
-            _same_sensor([sample("a", frame_range=(0, 300))], sample("b", frame_range=taken))
+            same_sensor([sample("a", frame_range=(0, 300)), sample("b", frame_range=taken)])
 
 
 STACK = np.random.default_rng(8).integers(0, 4096, (6, 32, 48)).astype(np.uint16)

@@ -70,7 +70,7 @@ def test_a_map_of_coarse_codes_has_the_bars_of_its_values(log: bool) -> None:
     values[0, :3] = np.nan, 1e9, -1e9 if not log else 0.0
     packed = pack_map(values, Scale(-3.0, 0.5, log))
     assert packed.bars is not None
-    first, parts, counts = packed.bars.first, packed.bars.parts, packed.bars.counts
+    first, parts, counts = packed.bars["first"], packed.bars["parts"], np.array(packed.bars["counts"])
     assert 60 < counts.size < 130
     edges = -3.0 + 0.5 * (first - 2 - 0.5 + np.arange(counts.size + 1) / parts)
     with np.errstate(divide="ignore", invalid="ignore"):

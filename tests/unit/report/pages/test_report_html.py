@@ -19,7 +19,7 @@ from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import report_figures
 from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.inspector import text_of
-from pchem_pipeline.report.pages.page import GLOSSARY, chart_script, explained, figure_tables
+from pchem_pipeline.report.pages.page import GLOSSARY, anchor_of, chart_script, explained, figure_tables
 from pchem_pipeline.report.pages.report import citation, render_report
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
@@ -113,7 +113,7 @@ def test_words_of_the_field_lead_to_the_glossary(page: Page) -> None:
     entries = {a.get("id") for a in page.of("dt")}
     links = {str(a["href"])[1:] for a in page.of("a") if a.get("class") == "term"}
     assert {"term-read-noise", "term-hot-pixels", "term-fixed-pattern-noise"} <= links <= entries
-    assert {term.id for term in GLOSSARY} <= entries
+    assert {anchor_of(term[0]) for term in GLOSSARY} <= entries
     assert str(explained("Hot pixels <b>, hot pixels")) == (
         '<a class="term" href="#term-hot-pixels">Hot pixels</a> &lt;b&gt;, hot pixels'
     )

@@ -13,7 +13,6 @@ from helpers.drawn_pixels import codes
 from helpers.small_stacks import Stack
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import split_frames
 from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
@@ -23,6 +22,8 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.stages.discrepancy import discrepancy
 from pchem_pipeline.stages.discrepancy.window import (
+    SURVEY,
+    Spot,
     Survey,
     Window,
     choose_window,
@@ -45,7 +46,7 @@ def test_a_small_stack_or_the_region_asked_for_is_looked_at_whole():
 
 
 def stored(survey):
-    return Survey.of_numbers(json.loads(json.dumps(survey.numbers())))
+    return SURVEY.validate_python(json.loads(json.dumps(SURVEY.dump_python(survey, mode="json"))))
 
 
 def test_odd_frames_are_not_looked_at_and_those_delivered_twice_once():
@@ -109,8 +110,7 @@ def test_frames_of_the_window_are_those_of_the_stack():
 
 
 def place(p=1e-9, **region):
-    found = Region.model_validate(region)
-    return Suspect(family="", z=6.0, log_p=np.log(p), inside=1.0, outside=0.0, region=found)
+    return Spot(Region.model_validate(region), p)
 
 
 def test_the_window_lies_where_the_sensor_disagrees_half_of_it_outside():

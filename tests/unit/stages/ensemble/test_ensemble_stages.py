@@ -27,7 +27,6 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.electrons.electrons import NO_NUMBER
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
-from pchem_pipeline.model.ensemble.ensemble import DnAxis
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
@@ -36,14 +35,12 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
-from pchem_pipeline.stages.fit.fit import code_sums
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
 NY, NX, FRAMES = 40, 48, 400
-HISTOGRAM = ("counts", "origin", "under", "over")
 FAILED_PIXEL = (3, 5)
 
 
@@ -263,39 +260,6 @@ def test_result_depends_on_neither_tile_nor_backend(finished, tmp_path, tile, ex
     assert_same(ensemble_of(context.store), ensemble_of(finished.store))
     for name in ("maps/read_noise_e", "maps/quality", "electrons/electron_number"):
         np.testing.assert_array_equal(context.store.read(name), finished.store.read(name))
-
-
-def test_samples_that_the_fit_counted_need_no_histograms(finished, sensor, tmp_path, monkeypatch):
-    context = sensor(frames=250)
-    store = context.store
-    for tile in context.tiles():
-        read = {name: store.read(f"histogram/{name}", tile.region) for name in HISTOGRAM}
-        fit = {name: store.read(f"fit/{name}", tile.region) for name in PARAMETERS}
-        store.records.mark("fit", "truth", tile.key, {"codes": code_sums(read, list(fit.values()))})
-    plain_read = RunStore.read
-
-    def read_little(self, name, *region):
-        assert name != "histogram/counts"
-        return plain_read(self, name, *region)
-
-    completed(context, "maps")
-    monkeypatch.setattr(RunStore, "read", read_little)
-    completed(context, "ensemble")
-    assert_same(ensemble_of(store), ensemble_of(finished.store))
-    found, expected = (each.attributes("ensemble") for each in (store, finished.store))
-    assert found["samples_beyond_dn_all_frames"] == expected["samples_beyond_dn_all_frames"]
-
-
-def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis():
-    counts = np.arange(12, dtype=np.uint16).reshape(1, 3, 4)
-    origin = np.array([[100, 100, 102]], np.int32)
-    outside = {"under": np.array([[1, 10, 100]], np.uint32), "over": np.array([[0, 1, 0]], np.uint32)}
-    maps = [np.array([[1.0, np.nan, 1.0]])] * 4
-    content = code_sums({"counts": counts, "origin": origin, **outside}, maps)
-    assert content == {"dn": [101, 102, 103, 104, 105], "samples": [1, 10, 12, 10, 11], "outside": 101}
-    samples, beyond = ensemble_stage.on_axis(content, DnAxis(102, 3))
-    assert samples.tolist() == [10, 12, 10]
-    assert beyond == 101 + 1 + 11
 
 
 def test_all_frames_need_no_frames(sensor, tmp_path, monkeypatch):

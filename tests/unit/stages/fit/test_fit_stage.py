@@ -37,8 +37,6 @@ def test_words_given_in_common_depend_on_no_tiling(tmp_path, monkeypatch):
     monkeypatch.setattr(fit, "_LARGEST_POOL", 60)
     assert fit.judge_sensor(context) == words[0].size
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0])
-    monkeypatch.setattr(fit, "_LARGEST_KEPT", 0)
-    assert fit.judge_sensor(context) == words[0].size
     # fewer pixels than make a pool take the words back
     monkeypatch.setattr(fit, "_LARGEST_POOL", 10)
     assert fit.judge_sensor(context) == 0
