@@ -358,13 +358,16 @@ def _note(axes: Axes, text: str, corner: str) -> None:
     axes.text(x, y, text, transform=axes.transAxes, **style)
 
 
+def _decade(place: float, _: object) -> str:  # a lambda could not be pickled
+    return power_of_ten(round(np.log10(place))) or "1"
+
+
 def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
     """Set scale and ticks of an axis; of whole numbers, and along x, at most so many."""
     one, set_scale = getattr(axes, f"{name}axis"), getattr(axes, f"set_{name}scale")
     if axis.log:
         set_scale("log")
-        # characters: a formula takes ten times as long
-        one.set_major_formatter(lambda place, _: power_of_ten(round(np.log10(place))) or "1")
+        one.set_major_formatter(_decade)  # characters: a formula takes ten times as long
     elif axis.linear_to:
         set_scale("symlog", linthresh=axis.linear_to, linscale=1.5)
     if axis.ticks:
