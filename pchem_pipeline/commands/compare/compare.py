@@ -352,7 +352,8 @@ def _map_words(each: MapDifference, why: Reasons, limit: float | str | None, uni
     if why.shifted:
         text.append(f"median changed by {measured(each.median, each.median_stderr, unit)}")
     if why.lines:
-        text.append(f"{first_few(why.lines)} changed against the others")
+        moved = (f"{line} moved by {measured(*change, unit)}" for line, change in why.lines.items())
+        text.append(f"{first_few(moved)} against the others")
     if limit is not None:
         text.append(f"limit {_limit_words(limit, unit)}")
     if why.pixels and not why.shifted:

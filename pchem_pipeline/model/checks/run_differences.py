@@ -88,7 +88,8 @@ class MapDifference:
         margin: the same in standard errors, (ny, nx).
         beyond_z: median of ``z`` less the margin, towards where the values moved.
         lines: of each row, then column: by how much the median of its ``z`` less `median_z` is beyond the
-            margin, and the pixels that count, (2, ny + nx).
+            margin, the same of the differences with its standard error, and the pixels that count,
+            (4, ny + nx).
         spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
         n_counted: pixels that count: good fits in both.
         largest_z: largest absolute value of ``z`` among them.
@@ -219,10 +220,12 @@ def _difference(
         margin = np.where(unit > 0, most / unit, np.nan)
     counted, core = z[counts], summarise(z[counts])
     whole = summarise(difference[counts])
-    masked = np.ma.MaskedArray([z - core.median, margin], np.broadcast_to(~counts, (2, *z.shape)))
+    each = [z - core.median, margin, difference - whole.median, unit]
+    masked = np.ma.MaskedArray(each, np.broadcast_to(~counts, (4, *z.shape)))
     medians = [np.ma.median(masked, axis).filled(0.0) for axis in (2, 1)]  # type: ignore[no-untyped-call]
-    moved, most_z = np.concatenate(medians, axis=1)
+    moved, most_z, change, error = np.concatenate(medians, axis=1)
     in_line = np.concatenate([counts.sum(1), counts.sum(0)])
+    error *= np.sqrt(np.pi / (2.0 * np.maximum(in_line, 1)))
     beyond = summarise(np.sign(core.median) * counted - margin[counts]).median
     return MapDifference(
         difference=difference,
@@ -233,7 +236,7 @@ def _difference(
         limit=most,
         margin=margin,
         beyond_z=beyond,
-        lines=np.stack([np.abs(moved) - most_z, in_line]),
+        lines=np.stack([np.abs(moved) - most_z, change, error, in_line]),
         spread_z=core.robust_sd,
         n_counted=counted.size,
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
@@ -247,7 +250,8 @@ class Reasons:
     shifted: bool  # the median is beyond the limit
     spread: bool  # ``z`` scatters more than its standard errors allow
     pixels: bool  # single pixels changed
-    lines: tuple[str, ...] = ()  # rows and columns that moved against the others by more than the limit
+    #: rows and columns that moved against the others by more than the limit: by how much, with its error
+    lines: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         """Return whether there is any."""
@@ -273,7 +277,7 @@ def reasons_of_change(
     bias = _BIAS * np.ptp(share) / np.sqrt(share.sum())
     mean = np.exp(-0.5 * ndtri(f) ** 2) / np.sqrt(2.0 * np.pi) / f
     bias += np.ptp(mean * np.sqrt(share / share.sum()))
-    beyond, in_line = found.lines
+    beyond, change, change_error, in_line = found.lines
     error = max(1.0 + _TRUST, found.spread_z) * np.sqrt(np.pi / (2.0 * np.maximum(in_line, 1)))
     rows = len(found.z)
     lines = np.flatnonzero((in_line >= _LEAST_LINE) & (beyond > bias + LIMIT * error))
@@ -281,5 +285,8 @@ def reasons_of_change(
         shifted=bool(found.beyond_z > bias + LIMIT * np.sqrt(np.pi / (2.0 * n))),
         spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),
         pixels=found.n_changed > 0,
-        lines=tuple(f"row {i}" if i < rows else f"column {i - rows}" for i in lines.tolist()),
+        lines={
+            f"row {i}" if i < rows else f"column {i - rows}": (float(change[i]), float(change_error[i]))
+            for i in lines.tolist()
+        },
     )

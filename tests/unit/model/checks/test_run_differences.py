@@ -154,12 +154,15 @@ def test_a_column_that_moved_against_the_others_is_named(limit):
         change: reasons_of_change(compared((one, error), (other + moved_by(change), error), limit=limit))
         for change in (0.0, least - 1.0, least + 1.0)
     }
-    assert [why.lines for why in found.values()] == [(), (), ("column 7",)]
+    assert [list(why.lines) for why in found.values()] == [[], [], ["column 7"]]
+    moved, stderr = found[least + 1.0].lines["column 7"]
+    assert stderr == pytest.approx(np.sqrt(2.0 * np.pi / (2 * SHAPE[0])))
+    assert abs(moved - (least + 1.0)) < 5.0 * stderr
     # the whole sensor is no column, and odd pixels are none
     everywhere = reasons_of_change(compared((one, error), (other + 3.0, error), limit=limit))
-    assert (everywhere.shifted, everywhere.lines) == (True, ())
+    assert (everywhere.shifted, everywhere.lines) == (True, {})
     other[:20, 3] += 100.0
-    assert reasons_of_change(compared((one, error), (other, error), limit=limit)).lines == ()
+    assert reasons_of_change(compared((one, error), (other, error), limit=limit)).lines == {}
 
 
 def test_unchanged_nights_alarm_at_the_stated_rate():
