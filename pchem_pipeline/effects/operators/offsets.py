@@ -428,7 +428,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         "frame_noise": "distant rows of a frame: 1/f noise does not correlate them",
         "interpixel_capacitance": "dark frames: amplifier noise stays, coupled charge vanishes",
         "periodic_pickup": "spectrum in readout order: pickup is a line, 1/f noise falls",
-        "bias_jumps": "means of successive frames: those after a jump stay, those of 1/f noise are hardly alike",
+        "bias_jumps": "means of successive frames: a jump stays, those of 1/f noise are hardly alike",
     }
     typical_values = tuple({"noise_dn": 0.5, "taps": taps} for taps in (1, 4, 2, 8))
     noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the noise, DN")
