@@ -8,6 +8,7 @@ the likelihood is not quadratic, a few estimates in 10,000 are many of their own
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -220,10 +221,9 @@ def _difference(
         margin = np.where(unit > 0, most / unit, np.nan)
     counted, core = z[counts], summarise(z[counts])
     whole = summarise(difference[counts])
-    each = [z - core.median, margin, difference - whole.median, unit]
-    masked = np.ma.MaskedArray(each, np.broadcast_to(~counts, (4, *z.shape)))
-    medians = [np.ma.median(masked, axis).filled(0.0) for axis in (2, 1)]  # type: ignore[no-untyped-call]
-    moved, most_z, change, error = np.concatenate(medians, axis=1)
+    moved, most_z, change, error = (
+        _line_medians(values, counts) for values in (z - core.median, margin, difference - whole.median, unit)
+    )
     in_line = np.concatenate([counts.sum(1), counts.sum(0)])
     error *= np.sqrt(np.pi / (2.0 * np.maximum(in_line, 1)))
     beyond = summarise(np.sign(core.median) * counted - margin[counts]).median
@@ -241,6 +241,14 @@ def _difference(
         n_counted=counted.size,
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
     )
+
+
+def _line_medians(values: FloatArray, counts: BoolArray) -> FloatArray:
+    """Return the median of the pixels that count in each row, then column; NaN where none does."""
+    known = np.where(counts, values, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of a line without any
+        return np.concatenate([np.nanmedian(known, axis=axis) for axis in (1, 0)])
 
 
 @dataclass(frozen=True)
