@@ -129,9 +129,10 @@ class Wave(NamedTuple):
 
     @property
     def alternates(self) -> bool:
-        """Whether it repeats itself after two frames, rows and columns, as circuits that take turns do."""
-        cycles = self.per_frame, self.per_row, self.per_column
-        return all(each is not None and 2.0 * each % 1.0 == 0.0 for each in cycles)
+        """Whether it repeats itself after two rows and columns, or frames, as circuits that take turns do."""
+        space = self.per_row, self.per_column
+        cycles = space if any(space) else (self.per_frame,)
+        return all(each is not None and abs(2.0 * each - round(2.0 * each)) < 1e-5 for each in cycles)
 
 
 @dataclass(frozen=True)

@@ -346,12 +346,12 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         """Return the highest lines of the periodograms of the row and the column means, and of all samples.
 
         Over frames and lines together (the phase runs on), and within frames (random phase). What alternates
-        from row to row, column to column and frame to frame is no pickup.
+        from row to row and column to column, or from frame to frame, is no pickup.
         """
         if evidence.time is None:
             return ()
         time, alpha = evidence.time, responsivity(evidence)
-        found = [(wave, mean_response(evidence)) for wave in time.waves if not wave.alternates]
+        found = [(wave, mean_response(evidence)) for wave in time.waves]
         for means in (time.row_readout, time.column_readout):
             line, loose = coherent_line(means, time.frames, time.n_run), incoherent_line(means)
             # a phase that runs on explains all that a random one would
@@ -362,6 +362,8 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
                 found.append((wave if means is time.row_readout else across, alpha))
         kept: list[Self] = []
         for wave, response in sorted(found, key=lambda each: -each[0].excess):
+            if wave.alternates:
+                continue
             pickup = cls(
                 amplitude_dn=wave.amplitude / response,
                 cycles_per_row=wave.per_row,

@@ -124,6 +124,20 @@ def test_some_rows_of_a_frame_have_its_slow_noise():
     assert effect.to_window((24, 32), (0, 6), (64, 6)).to_sensor((24, 32), (0, 6), (64, 6)) == effect
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_checkerboard_that_takes_turns_is_no_pickup(every):
+    """Nor are every second of its columns, whose rows take turns; a wave of any other length is."""
+    frames = taken(drawn_truth((24, 48)), n_frames=1200, seed=52)[:, :, ::every].astype(np.int64)
+    t, y, x = np.indices(frames.shape)
+    checkered = frames + 3 * (-1) ** (t + y + every * x)
+    guesses = PeriodicPickup.estimate(seen(checkered.astype(np.uint16)))
+    assert not any(abs(guess.cycles_per_row) > 0.49 for guess in guesses)
+    wave = np.rint(3.0 * np.sin(2.0 * np.pi * (0.31 * y + 0.17 * t))).astype(np.int64)
+    assert PeriodicPickup.estimate(seen((frames + wave).astype(np.uint16)))[
+        0
+    ].cycles_per_row == pytest.approx(0.31, abs=0.01)
+
+
 @pytest.mark.parametrize("rows", [24, 12])
 def test_noise_in_read_order_goes_on_from_frame_to_frame(rows):
     """Means of successive frames, of all rows or half of them, are as alike as those of one long record."""
